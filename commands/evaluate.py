@@ -35,7 +35,7 @@ def table(report: stage.Report) -> str:
         names = [name for name in report if name.startswith(prefixes)]
         if names:
             lines.append(title)
-            # A title says what its only prefix says.
+            # Under a title with a single prefix the labels go without it.
             lines += [
                 _row(report, name, name.removeprefix(prefixes[0]) if len(prefixes) == 1 else name) for name in names
             ]

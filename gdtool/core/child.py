@@ -33,7 +33,7 @@ _SETTINGS = {
     "MALLOC_TOP_PAD_": str(2**26),
 }
 
-# Children that import a module meanwhile and wait for a request, by that module.
+# Prepared children, by the module that they import.
 _waiting: dict[str, list[subprocess.Popen]] = {}
 
 if hasattr(os, "register_at_fork"):
@@ -47,7 +47,7 @@ def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: in
     """
     module = _module_of(function)
     waiting = _waiting.setdefault(module, [])
-    with contextlib.suppress(OSError):  # then begin() starts it, and tells what fails
+    with contextlib.suppress(OSError):  # begin() then starts one, and reports what fails
         while len(waiting) < count:
             waiting.append(_started((module, *modules)))
 
@@ -155,7 +155,7 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         env=_SETTINGS | os.environ,
     )
-    with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
+    with contextlib.suppress(BrokenPipeError):  # the child is dead already: result() says why
         assert process.stdin is not None  # a pipe
         process.stdin.write(pickle.dumps((sys.path, modules)))
         process.stdin.flush()
@@ -191,7 +191,7 @@ def serve() -> None:
     with os.fdopen(0, "rb", closefd=False) as file:
         sys.path[:], modules = pickle.load(file)
         for module in modules:
-            with contextlib.suppress(Exception):  # told when a function of it is asked for
+            with contextlib.suppress(Exception):  # reported when one of its functions is requested
                 importlib.import_module(module)
         try:
             place, module, name, args, kwargs, memory_mb = pickle.load(file)
@@ -219,10 +219,10 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
     except MemoryError:
         return "failed", "ran out of memory" if memory_mb is None else f"needs more than {memory_mb} MB"
     except ImportError as error:
-        # A shared library that the system lacks is told: a fallback would hide why the result is worse.
+        # A missing system library is reported: a fallback would hide why the result is worse.
         library = None if isinstance(error, ModuleNotFoundError) else errors.missing_library(error)
         return ("error", library) if library else ("failed", f"{type(error).__name__}: {error}")
-    except Exception as error:  # the parent knows a fallback
+    except Exception as error:  # the parent has a fallback
         return "failed", f"{type(error).__name__}: {error}"
 
 

@@ -81,11 +81,11 @@ def dataset_objects(dataset: Folder) -> Iterator[Folder]:
     """
     for entry in dataset.content_as(DatasetContent).objects:
         path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
-        found = open_folder(path, ("views",), "a dataset", check=False)
-        if found.manifest.digest != entry.digest:
+        views = open_folder(path, ("views",), "a dataset", check=False)
+        if views.manifest.digest != entry.digest:
             raise InputError(
                 path,
                 "is not the folder that the dataset lists (other digest)",
                 f"run gdtool render-dataset into {dataset.path} again",
             )
-        yield found
+        yield views

@@ -113,7 +113,7 @@ def _nearest(message: str, types: tuple[type[msgspec.Struct], ...]) -> str:
     unknown = re.search(r"unknown field `([^`]+)`", message)
     if not unknown:
         return ""
-    known = {field for one in types for field in one.__struct_fields__}
+    known = {field for struct in types for field in struct.__struct_fields__}
     near = difflib.get_close_matches(unknown[1], known, n=1)
     return f"did you mean {near[0]!r}?" if near else ""
 
@@ -135,8 +135,8 @@ def decode(raw: Any, path: Path) -> Manifest:
             path, fact[0].lower() + fact[1:], _nearest(fact, nested) or "see docs/format.md for the fields"
         ) from None
     checked_name(manifest.name, path, "name")
-    for one in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
-        relative_parts(one, path, "file path")
+    for relative in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
+        relative_parts(relative, path, "file path")
     for view in getattr(content, "views", ()):
         checked_name(view, path, "view")
     for entry in manifest.inputs:

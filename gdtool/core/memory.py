@@ -10,7 +10,7 @@ import os
 
 from gdtool.core.errors import ResourceError
 
-# What is read is held beside what is made from it: half is left to the stage.
+# The other half is left to the stage, which holds the input and the result at the same time.
 SHARE = 0.5
 
 

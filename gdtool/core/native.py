@@ -9,7 +9,7 @@ from types import ModuleType
 
 from gdtool.core.errors import GdtoolError, ResourceError, first_line, is_unmapped, missing_library
 
-# What pip installs, where that is not the module's name.
+# Name of the package for pip, where it differs from the module's.
 _DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "fast_simplification": "fast-simplification",
@@ -58,9 +58,9 @@ def import_error(error: ImportError | OSError, module: str) -> GdtoolError | Mem
         if _is_of(error.name, module):
             return ResourceError(package, "is not installed", f"pip install {install}")
     else:
-        found = missing_library(ImportError(str(error), name=package))
-        if found:
-            return found
+        problem = missing_library(ImportError(str(error), name=package))
+        if problem:
+            return problem
     return ResourceError(package, f"cannot be loaded ({first_line(error)})", f"pip install --force-reinstall {install}")
 
 

@@ -35,8 +35,8 @@ class Origin:
         """Raise InputError where the input has another digest than the manifest lists."""
         kind = "source"
         if is_folder(self.path):
-            found = read_manifest(self.path)
-            kind, digest = found.kind, found.digest
+            manifest = read_manifest(self.path)
+            kind, digest = manifest.kind, manifest.digest
         else:
             digest = sources.digest(self.path)
         if digest != self.entry.digest:
@@ -67,13 +67,13 @@ def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
             if not is_folder(path) or path in seen:
                 continue
             seen.add(path)
-            if read_manifest(path).kind == "model":  # what it was made with, not what of
+            if read_manifest(path).kind == "model":  # it was made with the model, not from it
                 continue
             origin.require_same(cure)
-            # Shown as the user would write it, where the chain lies beside the folder that was given.
-            found = open_folder(Path(os.path.normpath(origin.of.path / origin.entry.path)), check=False)
-            yield found if found.path.resolve() == path else open_folder(path, check=False)
-            queue.append(found)
+            # The path as the user would write it, where the chain lies beside the folder that the user named.
+            nearby = open_folder(Path(os.path.normpath(origin.of.path / origin.entry.path)), check=False)
+            yield nearby if nearby.path.resolve() == path else open_folder(path, check=False)
+            queue.append(nearby)
 
 
 def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
@@ -84,7 +84,7 @@ def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
     """
     if folder.kind == kind:
         return folder
-    return next((found for found in ancestors(folder, cure) if found.kind == kind), None)
+    return next((ancestor for ancestor in ancestors(folder, cure) if ancestor.kind == kind), None)
 
 
 def missing_origin(folder: Folder, cure: str) -> Origin | None:
@@ -92,8 +92,8 @@ def missing_origin(folder: Folder, cure: str) -> Origin | None:
 
     Raises as ancestors() does.
     """
-    for one in (folder, *ancestors(folder, cure)):
-        for origin in origins(one):
+    for member in (folder, *ancestors(folder, cure)):
+        for origin in origins(member):
             if origin.is_gone:
                 return origin
     return None
@@ -104,11 +104,11 @@ def find_source(folder: Folder, cure: str) -> str | None:
 
     Raises InputError where the file or a folder on the way was replaced since; cure as for ancestors().
     """
-    for one in (folder, *ancestors(folder, cure)):
-        for entry in one.manifest.inputs:
+    for member in (folder, *ancestors(folder, cure)):
+        for entry in member.manifest.inputs:
             if entry.path.startswith("procedural:"):
                 return entry.path
-        for origin in origins(one):
+        for origin in origins(member):
             if origin.path.is_file():
                 origin.require_same(cure)
                 return str(origin.path)

@@ -34,7 +34,7 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
     deadline, told = time.monotonic() + wait_seconds, False
     while True:
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
-        if os.fstat(handle).st_size:  # a lock of ours is empty, and is removed in the end
+        if os.fstat(handle).st_size:  # gdtool's lock is empty, and is removed in the end
             os.close(handle)
             raise OutputError(
                 path,

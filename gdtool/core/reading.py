@@ -130,14 +130,16 @@ def _unfit_string(value: Any) -> str | None:
     """Say where a string of a parsed JSON holds a lone surrogate, and which; None where none does."""
     waiting: list[tuple[str, Any]] = [("", value)]
     while waiting:
-        place, one = waiting.pop()
-        if isinstance(one, dict):
-            waiting += [(f"{place}.{key}", inner) for key, inner in one.items()]
-            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in one if not key.isascii()]
-        elif isinstance(one, list):
-            waiting += [(f"{place}[{i}]", inner) for i, inner in enumerate(one) if isinstance(inner, (str, dict, list))]
-        elif isinstance(one, str) and not one.isascii():
-            surrogates = "".join(c for c in one if "\ud800" <= c <= "\udfff")
+        place, part = waiting.pop()
+        if isinstance(part, dict):
+            waiting += [(f"{place}.{key}", inner) for key, inner in part.items()]
+            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in part if not key.isascii()]
+        elif isinstance(part, list):
+            waiting += [
+                (f"{place}[{i}]", inner) for i, inner in enumerate(part) if isinstance(inner, (str, dict, list))
+            ]
+        elif isinstance(part, str) and not part.isascii():
+            surrogates = "".join(c for c in part if "\ud800" <= c <= "\udfff")
             fault = text_fault(surrogates, byte_escapes=True)
             if fault:
                 return f"{place.lstrip('.')} {fault}"

@@ -65,7 +65,7 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
         relative = "/".join(part for part in (folder, place, _plain(name)) if part)
         try:
             relative_parts(relative, subject, what, levels_up=OBJ_LEVELS_UP)
-        except InputError:  # this place is not the file's wish
+        except InputError:  # the name leads out of this place
             continue
         path = path_inside(model.parent, relative, subject, what, levels_up=OBJ_LEVELS_UP)
         if is_readable(path):

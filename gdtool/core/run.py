@@ -45,9 +45,9 @@ class Settings:
     force: bool = False
     threads: int = 0
     device: str = "cpu"
-    # Which part of the sources, counted from 1, and of how many.
+    # (i, n): work on the i-th of n parts of the sources, counted from 1.
     shard: tuple[int, int] = (1, 1)
-    # A Ray cluster to fan out on, for stages that make datasets.
+    # Address of a Ray cluster that shares the sources out, for stages that make datasets.
     ray: str | None = None
 
 
@@ -89,19 +89,19 @@ class Job:
 
 
 def run_one(
-    stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], settings: Settings
+    stage: Stage, all_sources: list[Source], options: Any, flags: dict[str, str | None], settings: Settings
 ) -> Result:
     """Run a stage on one source (or, when it gathers, on all of them) and publish the result.
 
     flags: the second inputs that the user names.
     """
-    named = default_output(stage, given[0], settings.output, settings.several and not stage.gathers)
+    named = default_output(stage, all_sources[0], settings.output, settings.several and not stage.gathers)
     target = output_place(named)
-    refuse_overlap(target, _paths(given))
-    _refuse_other_source(target, stage, given[0], settings.output is not None and not settings.several)
+    refuse_overlap(target, _paths(all_sources))
+    _refuse_other_source(target, stage, all_sources[0], settings.output is not None and not settings.several)
     if settings.dry_run:
         return Result(named, stage.writes, "would run")
-    job = _prepare(stage, given, options, flags, named, target)
+    job = _prepare(stage, all_sources, options, flags, named, target)
     start = time.perf_counter()
     with _parents(target), locked(target):
         clear_stale(target)
@@ -121,15 +121,15 @@ def run_one(
 
 
 def _prepare(
-    stage: Stage, given: list[Source], options: Any, flags: dict[str, str | None], named: Path, target: Path
+    stage: Stage, all_sources: list[Source], options: Any, flags: dict[str, str | None], named: Path, target: Path
 ) -> Job:
     """Find the second inputs, check the options before any work, and compute the key."""
-    second = second_inputs(stage, given[0], flags)
+    second = second_inputs(stage, all_sources[0], flags)
     refuse_overlap(target, _paths(second.by_flag.values()))
-    inputs = Inputs(given[0], sources.name_of(given[0]), second.by_flag, tuple(given))
+    inputs = Inputs(all_sources[0], sources.name_of(all_sources[0]), second.by_flag, tuple(all_sources))
     if stage.check is not None:
         stage.check(inputs, options)
-    roles: list[tuple[str, Source]] = [("source", source) for source in given]
+    roles: list[tuple[str, Source]] = [("source", source) for source in all_sources]
     roles += [(flag, source) for flag, source in second.by_flag.items() if source is not None]
     read = tuple(ReadInput(role, source, sources.digest(source)) for role, source in roles)
     digests = [(entry.role, entry.digest) for entry in read]
@@ -242,7 +242,9 @@ def _drop_workspace(stage: Stage, workspace: Path) -> None:
 
 def _paths(inputs: Iterable[Source | None]) -> list[Path]:
     """Return the paths of inputs, without those of generated objects."""
-    return [one.path if isinstance(one, Folder) else one for one in inputs if isinstance(one, (Folder, Path))]
+    return [
+        source.path if isinstance(source, Folder) else source for source in inputs if isinstance(source, (Folder, Path))
+    ]
 
 
 @contextlib.contextmanager
@@ -271,9 +273,9 @@ def _peak_memory_mb() -> float:
     """Return the largest resident set of this process or of one of its children, in MB."""
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
     try:
-        # Not RUSAGE_SELF: that counts what the process was before it became gdtool, a large parent say.
+        # Not RUSAGE_SELF: it also counts the memory of the process that started gdtool by exec.
         status = Path("/proc/self/status").read_text()
-        own = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+        largest = next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):
-        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return max(own, children)
+        largest = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return max(largest, children)

@@ -59,8 +59,8 @@ def run_all(
     if parts > 1:
         stream = itertools.islice(stream, part - 1, None, parts)
     if stage.gathers:
-        given = [sources.resolve(text, stage.reads, stage.name) for text in stream]
-        yield run_one(stage, given, options, flags, settings)
+        gathered = [sources.resolve(text, stage.reads, stage.name) for text in stream]
+        yield run_one(stage, gathered, options, flags, settings)
         return
     several = settings.several
     if settings.output is not None and not several:

@@ -17,7 +17,7 @@ from gdtool.core.kinds import Content
 from gdtool.core.manifest import Skip
 from gdtool.core.sources import Source
 
-# What numeric options take at most: more than anybody means, so that what is asked for is finite and fits the manifest.
+# Upper bounds of numeric options: more than anybody needs, but finite and within the range of a manifest's numbers.
 MOST_SEED = 2**63 - 1  # a 64-bit integer
 MOST_SECONDS = 7 * 86400.0  # a week
 LEAST_EXPOSURE, MOST_EXPOSURE = 1e-4, 1e4  # factors on radiance, 13 stops either way
@@ -111,8 +111,8 @@ class Stage:
 
     def second(self, flag: str) -> SecondInput:
         """Return the declaration of a second input."""
-        found = self.second_inputs[flag]
-        return SecondInput(found) if isinstance(found, str) else found
+        declared = self.second_inputs[flag]
+        return SecondInput(declared) if isinstance(declared, str) else declared
 
 
 class Output:

@@ -107,7 +107,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
     records = []
     for c in cameras:
         pose = tuple(float(x) for x in c.world_from_camera.ravel())
-        own = (
+        optics = (
             {"half_width": float(c.half_width)}
             if c.projection == "orthographic"
             else {k: float(getattr(c, k)) for k in ("fx", "fy", "cx", "cy")}
@@ -121,7 +121,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
                 world_from_camera=pose,
                 near=float(c.near),
                 far=float(c.far),
-                **own,
+                **optics,
             )
         )
     _write(path, Cameras(tuple(records)))

@@ -17,7 +17,7 @@ from gdtool.core.stage import Output
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
 
 CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
-_PASSING = 5  # copies of one domain's pictures while they are stacked, decoded and masked
+_PASSING = 5  # copies of a domain's pictures that exist at once while they are stacked, decoded and masked
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
         cv2.grabCut(picture, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 6, cv2.GC_INIT_WITH_MASK)
     finally:
         cv2.setNumThreads(threads)
-    found = ndimage.binary_opening((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
-    pieces, count = ndimage.label(found)
+    foreground = ndimage.binary_opening((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    pieces, count = ndimage.label(foreground)
     if not count:
-        return found
-    return pieces == 1 + int(np.argmax(ndimage.sum_labels(found, pieces, np.arange(1, count + 1))))
+        return foreground
+    return pieces == 1 + int(np.argmax(ndimage.sum_labels(foreground, pieces, np.arange(1, count + 1))))

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-DARK = 0.02  # linear: added before a logarithm is taken, so that noise in the dark is no detail
-BAND, WINDOW = 3.0, 6.0  # pixels: wavelengths that gains are told from, and the Gaussian window they are taken over
-FLOOR = 1e-3  # squared logarithms: less than this says nothing of a gain
+DARK = 0.02  # linear; added before a logarithm is taken, so that noise in dark parts does not count as detail
+BAND, WINDOW = (
+    3.0,
+    6.0,
+)  # pixels: standard deviations of the mean that detail is taken from, and of the window for gains
+FLOOR = 1e-3  # squared logarithms; with less detail than this the gain goes to 0
 
 
 def masked_mean(values: np.ndarray, mask: np.ndarray, width: float) -> np.ndarray:

@@ -12,6 +12,13 @@ from gdtool.core.errors import InputError
 from gdtool.images.color import rgba, srgb_from_linear, unit_range
 
 WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
+# Shares of the picture between which a subject is believed: less is a speck, more is no background.
+MIN_SUBJECT, MAX_SUBJECT = 0.002, 0.95
+# Lab units from the background at which a pixel is the subject: at least, and as a multiple of the background's noise.
+SUBJECT_DISTANCE, SUBJECT_NOISE = 5.0, 5
+SHADOW_WEIGHT = 0.5  # of the lightness below the background's: a soft shadow darkens without changing hue
+BORDER_SHARE = 0.03  # width of the border that the background is fitted to, as a share of the picture's side
+MAX_NOISE = 5  # Lab units; a background with more noise is not plain
 _CURE = "give a mask with --mask, a network with --matting, or cut the subject out (RGBA)"
 
 
@@ -76,7 +83,7 @@ def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndar
     from gdtool.images.matting import saliency
 
     coverage = _without_specks(saliency(_encoded(image), network)).astype(np.float32)
-    if not 0.002 < (coverage > 0.5).mean() < 0.95:
+    if not MIN_SUBJECT < (coverage > 0.5).mean() < MAX_SUBJECT:
         raise InputError(subject, f"shows {network} no subject that stands off its background", _CURE)
     return coverage
 
@@ -104,7 +111,7 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
                 lab / 20, labels, beta=200, mode="cg_j", tol=1e-3, return_full_prob=True, channel_axis=-1
             )[0]
     coverage = np.clip(_without_specks(coverage), 0, 1)
-    if (coverage > 0.5).mean() < 0.002:
+    if (coverage > 0.5).mean() < MIN_SUBJECT:
         raise InputError(subject, "shows no subject that stands off its background", _CURE)
     if scale < 1:
         coverage = resize(coverage, (height, width), order=1)
@@ -126,13 +133,12 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[
         return labels
     background, spread = fitted
     difference = lab - background
-    # A soft shadow darkens without changing hue: lightness below the background's counts for less.
-    weight = np.where(difference[..., :1] < 0, 0.5, 1.0) * (1, 0, 0) + (0, 1, 1)
+    weight = np.where(difference[..., :1] < 0, SHADOW_WEIGHT, 1.0) * (1, 0, 0) + (0, 1, 1)
     distance = np.sqrt(np.square(difference * weight).sum(-1))
-    labels = _trimap(distance, max(5.0, 5 * spread), spread)
+    labels = _trimap(distance, max(SUBJECT_DISTANCE, SUBJECT_NOISE * spread), spread)
     if not (labels == 1).any():
         raise InputError(subject, "shows no subject that stands off its background", _CURE)
-    if float((labels == 1).mean()) > 0.95:
+    if float((labels == 1).mean()) > MAX_SUBJECT:
         raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
     return labels
 
@@ -160,10 +166,10 @@ def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
     ring = np.ones((height, width), bool)
-    inset = max(2, round(0.03 * min(height, width)))
+    inset = max(2, round(BORDER_SHARE * min(height, width)))
     ring[inset:-inset, inset:-inset] = False
     samples, rows = lab[ring], basis[ring]
-    # A start that a subject on the border does not sway: the median color alone.
+    # Start with the pixels near the median color, which a subject on the border hardly changes.
     keep = np.linalg.norm(samples - np.median(samples, 0), axis=1)
     keep = keep <= max(8.0, 3 * float(np.median(keep)))
     spread = 0.0
@@ -177,7 +183,7 @@ def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
         keep = again
         if keep.sum() < 50:
             break
-    if keep.mean() < 0.5 or spread > 5:
+    if keep.mean() < 0.5 or spread > MAX_NOISE:
         return None
     return basis @ fit, spread
 

@@ -37,7 +37,7 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
         side = entry.shape[-1] if isinstance(entry.shape[-1], int) else SIDE
         picture = resize(color, (side, side), order=1, anti_aliasing=True)
         picture = (picture / max(float(picture.max()), 1e-6) - MEAN) / DEVIATION
-        found = np.asarray(
+        output = np.asarray(
             session.run(None, {entry.name: np.moveaxis(picture, -1, 0)[None].astype(np.float32)})[0][0, 0]
         )
     except Exception as failure:  # onnxruntime's own errors have no common class
@@ -46,7 +46,7 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
             f"is no network of U²-Net's structure: {str(failure).strip().splitlines()[0]}",
             "take u2net.onnx, u2netp.onnx or silueta.onnx",
         ) from None
-    low, high = float(found.min()), float(found.max())
+    low, high = float(output.min()), float(output.max())
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise InputError(network, "finds nothing in the picture", "give a mask with --mask")
-    return np.clip(resize((found - low) / (high - low), color.shape[:2], order=1), 0, 1).astype(np.float32)
+    return np.clip(resize((output - low) / (high - low), color.shape[:2], order=1), 0, 1).astype(np.float32)

@@ -6,10 +6,10 @@ import numpy as np
 
 from gdtool.images.color import srgb_from_linear
 
-PUBLISHED_SIZE = 256
-PSNR_MAX = 100.0  # of equal pictures; JSON has no infinity
+PUBLISHED_SIZE = 256  # pixels: side of the pictures in published tables
+PSNR_MAX = 100.0  # dB, of equal pictures; JSON has no infinity
 FULL = 0.99  # coverage from which a pixel lies wholly on the object
-_C1, _C2 = 0.01, 0.03
+_C1, _C2 = 0.01, 0.03  # constants K1 and K2 of Wang et al. 2004
 
 
 def psnr(image: np.ndarray, reference: np.ndarray, where: np.ndarray | None = None) -> float:
@@ -69,11 +69,11 @@ def resized_views(
     """
     if mask.shape[1:] == (height, width):
         return images, mask
-    small = np.stack([resized(one, height, width) for one in mask])
+    small = np.stack([resized(coverage, height, width) for coverage in mask])
     out = {}
     for domain, stack in images.items():
         weight = (mask[..., None], small[..., None]) if stack.ndim == 4 else (mask, small)
-        mean = np.stack([resized(one, height, width) for one in stack * weight[0]]) / np.maximum(weight[1], 1e-6)
+        mean = np.stack([resized(image, height, width) for image in stack * weight[0]]) / np.maximum(weight[1], 1e-6)
         if domain == "normal":
             mean = mean / np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), 1e-12)
         out[domain] = np.where(weight[1] > 0, mean, 0).astype(np.float32)
@@ -157,10 +157,10 @@ def views_metrics(
     for domain in shared:
         a, b = images[domain], true_images[domain]
         if domain in ("color", "albedo", "closed_form"):
-            found = color_metrics(a, mask, b, true_mask)
+            figures = color_metrics(a, mask, b, true_mask)
             if domain != "color":  # base color has no published protocol: the foreground is what counts
-                found = {name: value for name, value in found.items() if name.endswith("_masked")}
-            out |= {f"{domain}_{name}": value for name, value in found.items()}
+                figures = {name: value for name, value in figures.items() if name.endswith("_masked")}
+            out |= {f"{domain}_{name}": value for name, value in figures.items()}
         elif domain == "normal":
             out["normal_degrees"] = normal_degrees(a, mask, b, true_mask)
         elif domain == "depth":

@@ -9,12 +9,11 @@ from contextlib import contextmanager
 from gdtool.core.ending import GRACE, time_limit
 from gdtool.core.errors import ResourceError
 
-# A run ends within OVER x its time limit + MORE seconds: what it is asked for takes its time, reading, checking and
+# A run has to end within OVER x its time limit + MORE seconds. The limit is for the main work; reading, checking and
 # writing come on top.
 OVER, MORE = 2.0, 5.0
 _UNWIND = GRACE + 0.3  # seconds of MORE that are left for the end
-# A quick machine takes half the time of the one that the rates were measured on: what takes longer even so is refused
-# at once.
+# Share of the measured time that a quick machine takes. Work that would be too long even there is refused at once.
 _QUICK = 0.5
 
 

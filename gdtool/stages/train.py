@@ -25,7 +25,7 @@ from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stag
 
 MOST_STEPS = 10**9
 MOST_MINUTES = 525_600.0  # a year
-HELD_OUT = 4  # objects, or all but one where there are no more
+HELD_OUT = 4  # objects; all but one where there are fewer
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -99,7 +99,7 @@ def check(inputs: Inputs, options: Options) -> None:
     from gdtool.diffusion.data.sources import count_views_folders
 
     count = count_views_folders(inputs.on_disk)
-    # Of fewer objects than the default holds out, one is left to train on: that is no mistake of the user's.
+    # With fewer objects than the default holds out, one is left to train on: the user did not ask for that number.
     if options.held_out >= count and options.held_out != HELD_OUT:
         raise UsageError(
             f"--held-out {options.held_out}",

@@ -1,4 +1,4 @@
-"""Provenance is followed by path and digest."""
+"""Follow the provenance of a folder by path and by digest."""
 
 import dataclasses
 import shutil
@@ -44,7 +44,8 @@ def chain():
 
 def test_the_chain_is_found_and_paths_stay_readable(chain):
     assert [folder.path for folder in ancestors(chain, CURE)] == [Path("a/first")]
-    assert Path(find_source(chain, CURE)).read_bytes() == b"cat" and missing_origin(chain, CURE) is None
+    assert Path(find_source(chain, CURE)).read_bytes() == b"cat"
+    assert missing_origin(chain, CURE) is None
 
 
 def test_a_folder_that_was_replaced_is_told_and_refused(chain):
@@ -67,7 +68,9 @@ def test_what_was_moved_is_told(chain):
     assert find_ancestor(chain, "views", CURE) is None
     assert missing_origin(chain, CURE).path == Path.cwd() / "a/first"
     (warning,) = second_inputs(NEXT, chain, {}).warnings
-    assert "a/first" in warning and "is gone" in warning and "--views" in warning
+    assert "a/first" in warning
+    assert "is gone" in warning
+    assert "--views" in warning
 
 
 def test_a_path_through_a_linked_folder_records_where_things_really_lie():

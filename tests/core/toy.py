@@ -1,4 +1,4 @@
-"""A stage that needs nothing but core, for tests: copies its source and can be slow, fail or warn."""
+"""Define a stage that needs core only: it copies its source, and can be slow or fail."""
 
 import time
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""PNG files byte by byte, for what an encoder would not write."""
+"""Build PNG files byte by byte, in forms that an encoder would not write."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Atlas, surface and views folders of a torus, as stages would leave them, for tests of bake."""
+"""Write atlas, surface and views folders of a torus, as stages would, for tests of bake."""
 
 from __future__ import annotations
 

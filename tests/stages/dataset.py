@@ -1,4 +1,4 @@
-"""A dataset of analytic spheres, published by the runner as render-dataset would."""
+"""Publish a dataset of analytic spheres by the runner, as render-dataset would."""
 
 from __future__ import annotations
 
@@ -31,5 +31,6 @@ def write_spheres(root: Path, count: int = 3, **options) -> Path:
     results = list(
         run_all(SPHERES, (f"procedural:0..{count - 1}",), Options(**options), {}, Settings(output=root, several=True))
     )
-    assert len(results) == count and all(result.status == "done" for result in results)
+    assert len(results) == count
+    assert all(result.status == "done" for result in results)
     return root

@@ -1,4 +1,4 @@
-"""relight by the command line, on meshes made here."""
+"""Run gdtool relight on small generated meshes."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ def test_writes_frames_that_validate_and_skips_when_up_to_date(gdtool, square, t
     content = json.loads((path / "manifest.json").read_text())["content"]
     assert (content["frames"], content["environment"], content["light"]) == (3, "mid", light)
     frame = read_image(path / "000.png")
-    assert (
-        frame.shape == (32, 32, 4) and frame[16, 16, 3] == 255 and frame[0, 0, 3] == 0 and frame[16, 16, :3].min() > 0
-    )
+    assert frame.shape == (32, 32, 4)
+    assert frame[16, 16, 3] == 255
+    assert frame[0, 0, 3] == 0
+    assert frame[16, 16, :3].min() > 0
     assert "up to date" in gdtool("relight", square, *FAST, "--views", "3", "--light", light).stderr
 
 
@@ -51,7 +52,8 @@ def test_light_from_one_side_falls_on_that_side(gdtool, square, tmp_path):
     done = gdtool("relight", square, *FAST, "--views", "2", "--env", "front.exr", "--elevation", "0")
     assert done.returncode == 0, done.stderr
     front, back = (read_image(tmp_path / f"square.asset/renders/{k:03d}.png")[16, 16].astype(int) for k in (0, 1))
-    assert front[0] > front[1] > front[2] > 60 and back[:3].max() < 5
+    assert front[0] > front[1] > front[2] > 60
+    assert back[:3].max() < 5
 
 
 @pytest.mark.parametrize("light", ["sampled", "prefiltered", "sg"])
@@ -65,7 +67,8 @@ def test_either_reflection_model(gdtool, square, tmp_path, light):
         )
         assert json.loads((tmp_path / brdf / "manifest.json").read_text())["options"]["brdf"] == brdf
         frames[brdf] = read_image(tmp_path / brdf / "000.png").astype(int)
-    assert (frames["gltf"] != frames["paper"]).any() and np.abs(frames["gltf"] - frames["paper"]).max() < 60
+    assert (frames["gltf"] != frames["paper"]).any()
+    assert np.abs(frames["gltf"] - frames["paper"]).max() < 60
 
 
 def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
@@ -76,10 +79,13 @@ def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 0 and done.stdout == "square.asset/renders\n"
+    assert done.returncode == 0
+    assert done.stdout == "square.asset/renders\n"
     (tmp_path / "bad.glb").write_bytes(b"glTF")
     bad = gdtool("relight", "bad.glb", *FAST)
-    assert bad.returncode == 3 and "bad.glb" in bad.stderr and "Traceback" not in bad.stderr
+    assert bad.returncode == 3
+    assert "bad.glb" in bad.stderr
+    assert "Traceback" not in bad.stderr
     assert gdtool("relight", square, *FAST, "--env", "none.exr", "-o", "x").returncode == 3
     assert not (tmp_path / "x").exists()
 
@@ -90,7 +96,9 @@ def test_a_target_or_a_budget_instead_of_samples(gdtool, square, tmp_path):
     for target in (25, 45):
         assert gdtool("relight", square, *small, "--target-psnr", str(target), "-o", f"t{target}").returncode == 0
     few, many = (json.loads((tmp_path / f"t{t}/manifest.json").read_text())["content"]["report"] for t in (25, 45))
-    assert few["estimated_psnr"] >= 25 and many["estimated_psnr"] >= 45 and many["samples"] > few["samples"]
+    assert few["estimated_psnr"] >= 25
+    assert many["estimated_psnr"] >= 45
+    assert many["samples"] > few["samples"]
     assert gdtool("relight", square, *small, "--budget", "0.3", "-o", "b").returncode == 0
     assert read_image(tmp_path / "b/000.png")[16, 16, :3].min() > 0
     assert gdtool("relight", square, *small, "--budget", "1", "--target-psnr", "40", "-o", "c").returncode == 2
