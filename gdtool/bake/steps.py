@@ -27,7 +27,7 @@ Report = dict[str, bool | int | float | str]
 
 @dataclass(frozen=True)
 class StepOptions:
-    """What to bake, and how to store it.
+    """Choose what to bake, and how to store it.
 
     size, samples: of the maps, None where the source's detail decides (target.fineness). occlusion_rays per traced
     point, drawn by seed; 0: no ambient occlusion. height, confidence: make these maps too. bits per channel. padding in

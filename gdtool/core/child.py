@@ -106,10 +106,12 @@ class Running:
         self._talk.start()
 
     def _stop(self) -> None:
+        """End the child at its time limit."""
         self._timed_out = True
         self._process.kill()
 
     def _converse(self, request: bytes) -> None:
+        """Send the request, and read the answer until the child ends."""
         self._answer, self._printed = self._process.communicate(request)
         self._timer.cancel()
 
@@ -169,6 +171,7 @@ class _Pickler(pickle.Pickler):
     """
 
     def reducer_override(self, value: Any) -> Any:
+        """Pickle a native numeric dtype as a call of numpy.dtype."""
         numpy = sys.modules.get("numpy")
         if numpy is not None and isinstance(value, numpy.dtype) and value.kind in "biufc" and value.isnative:
             return numpy.dtype, (value.str,)
@@ -176,6 +179,7 @@ class _Pickler(pickle.Pickler):
 
 
 def _pickled(value: Any) -> bytes:
+    """Pickle a value with numpy's types by name."""
     file = io.BytesIO()
     _Pickler(file, protocol=5).dump(value)
     return file.getvalue()
@@ -227,6 +231,7 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
 
 
 def _limit_memory(megabytes: int) -> None:
+    """Let the address space of this process grow by so many megabytes, and no more."""
     import resource
 
     with Path("/proc/self/statm").open() as file:

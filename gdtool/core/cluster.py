@@ -41,6 +41,7 @@ def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: 
 
 
 def _connected(address: str) -> Any:
+    """Import Ray and connect it to the cluster. Raises ResourceError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
@@ -78,10 +79,12 @@ def _room(ray: Any, cores: int) -> int:
 
 
 def _any_done(ray: Any, waiting: dict[Any, str]) -> bool:
+    """Tell whether a task is done, without waiting."""
     return bool(waiting) and bool(ray.wait(list(waiting), num_returns=1, timeout=0)[0])
 
 
 def _next(ray: Any, waiting: dict[Any, str]) -> Any:
+    """Wait for a task; returns its result, or a GdtoolError where its worker died."""
     (done,), _ = ray.wait(list(waiting), num_returns=1)
     text = waiting.pop(done)
     try:

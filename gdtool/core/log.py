@@ -31,6 +31,7 @@ def printable(text: str) -> str:
 
 
 def _shown(character: str) -> str:
+    """Escape a character that would break a line; replace a lone surrogate."""
     code = ord(character)
     if 0xD800 <= code < 0xE000:
         return "\ufffd"

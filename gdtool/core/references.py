@@ -139,15 +139,20 @@ def referred_files(path: Path) -> list[Path]:
 
 
 class _Uri(msgspec.Struct):
+    """Decode the URI of a buffer or an image of a .gltf."""
+
     uri: str | None = None
 
 
 class _Uris(msgspec.Struct):
+    """Decode the parts of a .gltf that name files."""
+
     buffers: list[_Uri] = []
     images: list[_Uri] = []
 
 
 def _gltf_files(path: Path) -> Iterator[Path]:
+    """Yield the files that the buffers and images of a .gltf name."""
     document = msgspec.json.decode(path.read_bytes().removeprefix(b"\xef\xbb\xbf"), type=_Uris)
     for item in (*document.buffers, *document.images):
         if item.uri is not None and item.uri[:5].lower() != "data:":
@@ -160,6 +165,7 @@ def _gltf_files(path: Path) -> Iterator[Path]:
 
 
 def _obj_files(path: Path) -> list[Path]:
+    """List the libraries of an .obj and the textures that they name."""
     libraries: dict[str, Path] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:

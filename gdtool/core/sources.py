@@ -134,6 +134,7 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
 
 
 def _words(kinds: tuple[str, ...]) -> str:
+    """Join kinds for a message."""
     return " or ".join(kind.replace("-file", " files") for kind in kinds)
 
 

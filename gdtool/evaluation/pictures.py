@@ -31,7 +31,7 @@ Buffers = dict[str, np.ndarray]
 
 
 class PictureSet(NamedTuple):
-    """Pictures of k views: images by domain (k, h, w[, 3]), coverage (k, h, w), and the names of the views."""
+    """Hold pictures of k views: images by domain (k, h, w[, 3]), coverage (k, h, w), and the names of the views."""
 
     images: dict[str, np.ndarray]
     mask: np.ndarray

@@ -26,7 +26,7 @@ IDENTITY_TOLERANCE = 1e-12  # of the entries of a source_from_world that counts 
 
 @dataclass(frozen=True)
 class Shape:
-    """Triangles with the frame that they are in.
+    """Hold triangles and the frame that they are in.
 
     vertices (v, 3), faces (t, 3). quads: how many quads were cut into triangles. source_from_world: (4, 4), from the
     normalised frame to the source's; None for a file, which does not say. in_source_frame: the vertices are in the
@@ -42,7 +42,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class ShapeOptions:
-    """How to compare two shapes.
+    """Choose how two shapes are compared.
 
     frame: how a model file is brought into the result's frame, "auto", "source", "box" or "same" (see aligned_truth).
     samples: points drawn on each surface, by seed. threshold: the distance that counts as a match in the F-score, in

@@ -36,6 +36,7 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def _document(title: str, root: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Assemble a schema document."""
     out = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root, "title": title}
     return {**out, "$defs": definitions} if definitions else out
 

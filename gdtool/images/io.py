@@ -72,6 +72,7 @@ def decode_image(content: bytes, subject: str) -> np.ndarray:
 
 
 def _read(path: Path, name: str) -> np.ndarray:
+    """Read the stored pixels of a file, which OpenImageIO opens by `name`. Raises as read_image does."""
     import OpenImageIO as oiio
 
     oiio.attribute("limits:imagesize_MB", MAX_BYTES >> 20)
@@ -124,10 +125,12 @@ def _read(path: Path, name: str) -> np.ndarray:
 
 
 def _lower(text: str) -> str:
+    """Begin a message of OpenImageIO with a small letter."""
     return text[:1].lower() + text[1:]
 
 
 def _check_spec(path: Path, spec) -> None:
+    """Raise ResourceError for a header of too many pixels, InputError for CMYK, volumes and animations."""
     if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
         raise ResourceError(
             path,
@@ -176,6 +179,7 @@ def _channels(path: Path, names: list[str]) -> list[int]:
 
 
 def _check_finite(path: Path, pixels: np.ndarray) -> None:
+    """Raise InputError for the first pixel that is not finite."""
     for start in range(0, len(pixels), _ROWS):
         bad = ~np.isfinite(pixels[start : start + _ROWS])
         if bad.any():
@@ -256,6 +260,7 @@ def encode_pngs(images: list[np.ndarray], bits: int = 8, threads: int = 1) -> li
 
 
 def _write(path: Path, image: np.ndarray, kind: str) -> None:
+    """Write pixels of a kind ("uint8", "uint16" or "float"), and compare the file. Raises OutputError."""
     import OpenImageIO as oiio
 
     pixels = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))

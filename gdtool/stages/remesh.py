@@ -97,10 +97,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     enough = max(round(SECONDS_PER_QUAD * options.faces), round(2 * options.seconds), 1)
     with held_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
-        _run(inputs, options, out)
+        _remesh(inputs, options, out)
 
 
-def _run(inputs: Inputs, options: Options, out: Output) -> None:
+def _remesh(inputs: Inputs, options: Options, out: Output) -> None:
+    """Remesh one surface or mesh file and write the mesh."""
     from gdtool.geometry.simplify import CHILD_MODULES, reduced
 
     prepare(reduced, CHILD_MODULES)  # for the first child of remesh(), while the mesh is read

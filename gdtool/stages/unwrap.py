@@ -62,10 +62,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     cure = f"raise --seconds to {max(round(2 * options.seconds), 1)}, or run gdtool remesh with fewer --faces before"
     with held_to(options.seconds, "--seconds", inputs.name, cure):
-        _run(inputs, options, out)
+        _unwrap(inputs, options, out)
 
 
-def _run(inputs: Inputs, options: Options, out: Output) -> None:
+def _unwrap(inputs: Inputs, options: Options, out: Output) -> None:
+    """Unwrap one mesh and write the atlas."""
     from gdtool.geometry.simplify import CHILD_MODULES, reduced
 
     prepare(reduced, CHILD_MODULES)  # for the first child of unwrap(), while the mesh is read

@@ -91,6 +91,7 @@ def read(folder: Path) -> Pictures:
 
 
 def _find(folder: Path, domain: str, view: str) -> Path | None:
+    """Find the picture of a view in a domain; None where there is none."""
     places = [f"{domain}/"] + ([""] if domain == "color" else [])
     for place in places:
         for suffix in _SUFFIXES:
@@ -101,6 +102,7 @@ def _find(folder: Path, domain: str, view: str) -> Path | None:
 
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
+    """Return the height and width of a picture. Raises InputError where its camera has others."""
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             path,

@@ -97,7 +97,7 @@ def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """How to render views: the most samples per pixel, the images to keep by domain, and a factor on the color."""
+    """Choose how views are rendered: most samples per pixel, images to keep by domain, factor on the color."""
 
     samples: int
     domains: tuple[str, ...]
