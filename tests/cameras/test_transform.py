@@ -14,7 +14,7 @@ def camera(request):
 
 
 def similarity(scale=2.0):
-    """A turn about z by 90 degrees, a scale, and a shift."""
+    """Make a turn about z by 90 degrees, a scale, and a shift."""
     matrix = np.eye(4)
     matrix[:3, :3] = scale * np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     matrix[:3, 3] = 3, -1, 2

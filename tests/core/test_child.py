@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    """Children import this file."""
+    """Let children import this file."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
@@ -26,7 +26,7 @@ def double(array, noise=""):
 
 
 def of_own_type(arrays):
-    """Which are of numpy's own type, not of another that is equal to it; and the arrays."""
+    """Tell which arrays have a type object of numpy's own, and return the arrays too."""
     return [array.dtype is np.dtype(array.dtype.str) for array in arrays], arrays
 
 
@@ -51,7 +51,7 @@ def refuse():
 
 
 def read_by():
-    """The process, and whether a module that nobody needs is there."""
+    """Return the id of this process, and whether it has imported a module that nothing else needs."""
     return os.getpid(), "json.tool" in sys.modules
 
 
@@ -80,7 +80,7 @@ def test_arrays_survive_the_round_trip_to_a_child_that_prints():
 
 
 def test_arrays_from_a_child_share_numpys_own_types():
-    """ufunc.at takes ten times as long with types that are equal to these only; others come as they are."""
+    """ufunc.at takes ten times as long with type objects that only equal numpy's."""
     numbers = [
         np.arange(2).astype(kind)
         for kind in (bool, np.int8, np.int32, np.uint64, np.float32, float, complex)
@@ -187,13 +187,13 @@ def test_a_grandchild_dies_with_its_parent(tmp_path):
 
 
 def below(pid):
-    """Processes that it started, and that these started."""
+    """List the processes that a process started, and those that they started."""
     own = [int(one) for one in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()]
     return own + [other for one in own for other in below(one)]
 
 
 def alive(pid):
-    """Whether a process runs (a zombie that nobody has reaped yet does not)."""
+    """Tell whether a process runs; a zombie that is not reaped yet does not."""
     try:
         with Path(f"/proc/{pid}/stat").open() as file:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"

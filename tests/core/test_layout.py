@@ -32,8 +32,10 @@ def imports(path, top_level_only=False):
 
 
 def may_import():
-    """Room to the rooms that docs/architecture.md lets it import, itself among them; what stands in parentheses there
-    is a reason."""
+    """Read from docs/architecture.md which rooms each room may import, itself among them.
+
+    Text in parentheses there is a reason, not a room.
+    """
     rows = re.findall(r"^\| `gdtool/(\w+)/` \|[^|]*\|([^|]*)\|$", (ROOT / "docs/architecture.md").read_text(), re.M)
     return {room: {room, *re.findall(r"\w+", re.sub(r"\(.*?\)", "", others))} for room, others in rows}
 
@@ -100,7 +102,7 @@ def test_schemas_are_those_of_the_types():
 
 
 def processor_seconds(command):
-    """Least processor time of three runs: on a busy machine the clock on the wall says nothing of the program."""
+    """Measure the least processor time of three runs: wall-clock time depends on the other load of the machine."""
     least = float("inf")
     for _ in range(3):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -113,7 +115,7 @@ def processor_seconds(command):
 
 @pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)], ids=lambda a: a[0])
 def test_help_is_quick(arguments):
-    """Within three times what Python takes to start with click and msgspec, and with an example."""
+    """--help takes at most three times what Python takes to start with click and msgspec."""
     command = [sys.executable, "-m", "gdtool", *arguments]
     shown = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert len(arguments) == 1 or "Example" in shown

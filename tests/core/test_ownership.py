@@ -40,7 +40,7 @@ def cat():
 
 @pytest.fixture
 def made(cat):
-    """A result at out/, and a source that makes it stale."""
+    """Make a result at out/ and a source that makes it stale."""
     run(cat, output=Path("out"))
     Path("cat.png").write_bytes(b"other")
     return Path("out")
@@ -227,7 +227,7 @@ def test_the_index_of_several_does_not_replace_a_manifest_of_the_users():
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
 def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
-    """It could not be removed once it is replaced: it would be left beside the new one."""
+    """The replaced folder could not be removed, and would stay beside the new one."""
     os.chown(".", 65534, 65534)
     pid = os.fork()
     if not pid:

@@ -35,7 +35,7 @@ def run(stage, source, output):
 
 @pytest.fixture
 def chain():
-    """cat.png -> a/first -> a/second."""
+    """Make cat.png -> a/first -> a/second."""
     Path("cat.png").write_bytes(b"cat")
     Path("a").mkdir()
     run(STAGE, "cat.png", "a/first")

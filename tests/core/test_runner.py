@@ -38,7 +38,7 @@ def run(*arguments, options=None, **settings):
 
 
 def listen_to_interrupts():
-    """A shell starts background jobs deaf to SIGINT, and the tests may be one."""
+    """Restore SIGINT, which a shell ignores in background jobs, such as these tests may be."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -265,7 +265,7 @@ def test_two_processes_on_one_output_do_not_mix():
 
 
 def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
-    """A new bundled model makes old views stale: it is among the inputs that the key is made of."""
+    """A new bundled model makes old views stale, since its digest is part of the key."""
     from gdtool.core.second_inputs import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 

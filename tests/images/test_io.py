@@ -21,7 +21,7 @@ def picture() -> np.ndarray:
 
 
 def save(path, image: np.ndarray, **attributes) -> None:
-    """Write through OpenImageIO, with attributes of the spec."""
+    """Write an image through OpenImageIO, with attributes of the spec."""
     kind = {"uint8": "uint8", "uint16": "uint16", "float32": "float"}[image.dtype.name]
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], kind)
     for key, value in attributes.items():

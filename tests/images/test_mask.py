@@ -15,8 +15,7 @@ def scene(
     gradient: float = 0.0,
     noise: float = 0.01,
 ):
-    """A disc of radius 0.5 with a hole of radius 0.2 on a background that darkens downward: (picture uint8,
-    coverage)."""
+    """Draw a disc of radius 0.5 with a hole of radius 0.2; returns picture (uint8) and coverage."""
     y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
     r = np.hypot(x - center[0], y - center[1])
     coverage = np.clip((0.5 - r) * size / 2 + 0.5, 0, 1) * np.clip((r - 0.2) * size / 2 + 0.5, 0, 1)
@@ -95,7 +94,7 @@ def test_a_picture_without_a_subject_is_refused(image, mask, fact):
 
 
 def busy_scene(size: int = 320, contrast: float = 1.0):
-    """A reddish disc with stripes on leaves of greens and blues: (picture uint8, coverage)."""
+    """Draw a reddish disc with stripes on leaves of greens and blues; returns picture (uint8) and coverage."""
     y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
     coverage = np.clip((0.55 - np.hypot(x, y)) * size / 2 + 0.5, 0, 1)
     leaves = np.repeat(np.repeat(np.random.default_rng(1).random((size // 8, size // 8, 1)), 8, 0), 8, 1)

@@ -13,7 +13,7 @@ from tests.images.test_mask import busy_scene, overlap
 
 @pytest.fixture
 def network(tmp_path):
-    """A file with U²-Net's interface, a single convolution inside: it finds what is more red than blue or green."""
+    """Write a network with U²-Net's interface and a single convolution, which finds red."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
     from onnx import TensorProto, helper, numpy_helper

@@ -51,7 +51,7 @@ def test_resized_is_the_average_over_area():
 
 
 def test_color_protocols():
-    """A square object whose sRGB value is 0.1 off: masked sees 20 dB, published the share of the frame it covers."""
+    """A square object is off by 0.1 in sRGB: masked gives 20 dB, published depends on the share of the frame."""
     mask = np.zeros((1, 256, 256), np.float32)
     mask[:, 64:192, 64:192] = 1  # a quarter of the frame
     a, b = (linear_from_srgb(np.full((1, 256, 256, 3), value)) * mask[..., None] for value in (0.5, 0.6))
@@ -137,7 +137,7 @@ def test_nothing_in_common_gives_no_figure():
 
 
 def test_views_are_resized_over_what_they_cover():
-    """A half covered new pixel keeps the value of its covered half; a mean of normals is a unit vector."""
+    """A half covered new pixel keeps the value of its covered half; a mean of normals is made unit."""
     mask = np.zeros((1, 4, 4), np.float32)
     mask[:, :, :1] = 1
     normal = np.zeros((1, 4, 4, 3), np.float32)

@@ -27,7 +27,7 @@ SPHERES = Stage(
 
 
 def write_spheres(root: Path, count: int = 3, **options) -> Path:
-    """root/procedural-*.asset/views and root/manifest.json of count spheres."""
+    """Write root/procedural-*.asset/views of count spheres, and the index root/manifest.json."""
     results = list(
         run_all(SPHERES, (f"procedural:0..{count - 1}",), Options(**options), {}, Settings(output=root, several=True))
     )

@@ -19,12 +19,12 @@ FAST = ("--size", 128, "--ao-rays", 16)
 
 @pytest.fixture(scope="module")
 def chain(tmp_path_factory):
-    """Folders of a torus, made once; tests bake to places of their own."""
+    """Write the folders of a torus once; each test bakes to a place of its own."""
     return make_chain(tmp_path_factory.mktemp("chain") / "ring.asset")
 
 
 def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0) -> float:
-    """PSNR in sRGB of the asset's base colour at the pixels of views (the chain's), foreground that faces them only."""
+    """Measure the PSNR of the base color, in sRGB, over the pixels of the views in which the surface faces them."""
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rays
     from gdtool.geometry.rays import RayCaster
@@ -79,8 +79,7 @@ def test_materials_come_from_views_where_vertices_have_none(gdtool, tmp_path):
 
 
 def test_a_picture_finer_than_its_view_is_baked(gdtool, tmp_path):
-    """Blurred views of the torus, and the picture that they were made of, sharp: the asset has it where the front sees
-    it."""
+    """Views are blurred, their picture is sharp: the asset is sharp where the front view sees it."""
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.metrics import resized_views
 

@@ -17,7 +17,7 @@ FAST = ("--size", 64, "--ao-rays", 4)
 
 
 def slab(thickness=0.001):
-    """A closed plate, 1 x 1 x thickness: vertices (8, 3), quads (6, 4), a texture rectangle of its own for each."""
+    """Make a closed plate, 1 x 1 x thickness: vertices (8, 3), quads (6, 4), a texture rectangle for each quad."""
     x = np.array([-0.5, 0.5])
     vertices = np.array([[a, b, c] for a in x for b in x for c in x * thickness])
     # Front and back first.
@@ -28,7 +28,7 @@ def slab(thickness=0.001):
 
 
 def colored(vertices, quads, uv, corners, colors):
-    """A Scene whose quads have the texture colors (6, 3), 8 bits, in their rectangles."""
+    """Make a Scene whose quads have the texture colors (6, 3), 8 bits, in their rectangles."""
     image = np.zeros((48, 48, 3), np.uint8)
     for k, color in enumerate(colors):
         image[k // 3 * 16 : k // 3 * 16 + 16, k % 3 * 16 : k % 3 * 16 + 16] = color
@@ -44,7 +44,7 @@ COLORS = (RED, BLUE, GRAY, GRAY, GRAY, GRAY)
 
 
 def bake(gdtool, mesh, scene, *options):
-    """The asset's base color (s, s, 3) and manifest content."""
+    """Bake, and return the asset's base color (s, s, 3) and manifest content."""
     write_obj(Path("low.obj"), mesh)
     write_glb(Path("high.glb"), scene)
     done = gdtool("bake", "low.obj", "--model", "high.glb", *(options or FAST), "-o", "out")
@@ -55,7 +55,7 @@ def bake(gdtool, mesh, scene, *options):
 
 
 def middle(image, k):
-    """The texel in the middle of the k-th rectangle."""
+    """Return the texel in the middle of the k-th rectangle."""
     size = len(image)
     return image[int((k // 3 + 0.5) / 3 * size), int((k % 3 + 0.5) / 3 * size)]
 

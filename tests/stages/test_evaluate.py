@@ -25,14 +25,14 @@ MATRIX = np.array([[SIZE, 0, 0, 3], [0, SIZE, 0, -2], [0, 0, SIZE, 10], [0, 0, 0
 
 
 def egg(subdivisions=3):
-    """Triangles with longest side 1 (along y), asymmetric, normalised frame."""
+    """Make triangles with longest side 1 (along y), asymmetric, in the normalised frame."""
     mesh = trimesh.creation.icosphere(subdivisions, 0.5)
     vertices = np.asarray(mesh.vertices) * [0.6, 1, 0.8]
     return vertices, np.asarray(mesh.faces, np.int32)
 
 
 def egg_views(vertices, faces, size=48):
-    """Six true views with all that is constant on an egg of one material."""
+    """Render six true views of an egg of one material."""
     from gdtool.assets.scene import Material, Scene
     from gdtool.shading.render.render import Renderer
 
@@ -65,7 +65,7 @@ def write_egg_surface(path, inputs, scale=1.0, matrix=MATRIX):
 
 @pytest.fixture
 def chain(tmp_path):
-    """egg.obj (in its own frame) → egg.asset/views → surface (5 % too small, roughness 0.1 too low)."""
+    """Write egg.obj (in its own frame) → egg.asset/views → surface (5 % too small, roughness 0.1 too low)."""
     vertices, faces = egg()
     trimesh.Trimesh(vertices * SIZE + CENTER, faces, process=False).export(tmp_path / "egg.obj")
     root = tmp_path / "egg.asset"
@@ -82,7 +82,7 @@ def chain(tmp_path):
 
 
 def measured(result, reference=None, **options):
-    """The stage itself, in this process: a command takes seconds to start, and test_the_command runs it."""
+    """Call the stage in this process, since a command takes seconds to start; test_the_command runs the command."""
     found, against = (
         None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference)
     )
@@ -156,7 +156,7 @@ def test_every_kind_of_reference_is_accepted(chain, tmp_path):
 
 
 def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
-    """source.glb stands in the frame of the views."""
+    """source.glb is in the frame of the views."""
     from gdtool.assets.gltf_write import write_glb
     from gdtool.assets.scene import Scene
 

@@ -19,7 +19,7 @@ SIZE = 64
 
 
 def lopsided(points):
-    """A ball with a smaller one in front at the upper right: no axis can be swapped or turned over unnoticed."""
+    """Measure the distance to a ball with a smaller one in front at the upper right, which has no symmetry."""
     return np.minimum(sphere(points, 0.3), sphere(points - [0.28, 0.18, 0.22], 0.15))
 
 
@@ -82,7 +82,7 @@ def plain(tmp_path, turntable):
 
 
 def error(vertices, source_from_world):
-    """Mean distance (source units of the fixtures' solids) of vertices brought back to the solid's own frame."""
+    """Measure the mean distance of vertices from the solid, in the frame of the fixtures."""
     m = np.array(source_from_world).reshape(4, 4)
     return np.abs(lopsided(vertices @ m[:3, :3].T + m[:3, 3])).mean()
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("default")
 
 @pytest.fixture(scope="module")
 def address():
-    """Two nodes of one core each."""
+    """Start two nodes of one core each."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray.cluster_utils import Cluster
 
@@ -58,8 +58,10 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
 
 @pytest.fixture
 def where():
-    """The node a text is worked on; "crash" kills its worker, "fault" raises. Local, so that workers need not import
-    this file."""
+    """Return the node that works on a text; "crash" kills its worker, "fault" raises.
+
+    It is a local function, so that workers need not import this file.
+    """
 
     def work(text: str) -> str:
         import os
@@ -88,7 +90,7 @@ def test_both_nodes_work_and_a_dead_worker_is_an_error_of_its_source(address, wh
 
 
 def test_few_sources_are_taken_ahead(address, where):
-    """Sources are read as there is room for them, not all at once."""
+    """Sources are read when a core is free, not all at once."""
     taken = []
 
     def texts():

@@ -116,7 +116,7 @@ def test_paper_method_without_depth_uses_depth_from_normals(gdtool, folder, tmp_
 
 @pytest.mark.parametrize("method", ["grid", "paper"])
 def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_path, torus_views, method):
-    """Each view's normals point anywhere: no matched depth is confirmed by another view."""
+    """Normals are random: no matched depth is confirmed by another view."""
     cameras, images, mask = torus_views
     lies = np.random.default_rng(0).standard_normal(images["normal"].shape)
     lies = np.where(mask[..., None] > 0, lies / np.linalg.norm(lies, axis=-1, keepdims=True), 0)

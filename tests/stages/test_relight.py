@@ -23,7 +23,7 @@ def square(tmp_path):
 
 @pytest.fixture
 def gdtool(gdtool_here):
-    """Within this process, but for the tests that ask for the command itself."""
+    """Run commands within this process, except in tests that ask for the command itself."""
     return gdtool_here
 
 
@@ -45,7 +45,7 @@ def test_writes_frames_that_validate_and_skips_when_up_to_date(gdtool, square, t
 
 
 def test_light_from_one_side_falls_on_that_side(gdtool, square, tmp_path):
-    """The square faces +Z, three quarters across the image; light from there must reach its front and not its back."""
+    """The square faces +Z and fills three quarters of the image: light from there reaches its front, not its back."""
     image = np.zeros((32, 64, 3), np.float32)
     image[12:20, 44:52] = (20, 10, 5)
     write_exr(tmp_path / "front.exr", image)
@@ -58,7 +58,7 @@ def test_light_from_one_side_falls_on_that_side(gdtool, square, tmp_path):
 
 @pytest.mark.parametrize("light", ["sampled", "prefiltered", "sg"])
 def test_either_reflection_model(gdtool, square, tmp_path, light):
-    """A rough dielectric seen from the front differs by Disney's diffuse; both are finite, and recorded."""
+    """A rough dielectric differs between the models by Disney's diffuse term; both are finite and recorded."""
     frames = {}
     for brdf in ("gltf", "paper"):
         assert (
@@ -91,7 +91,7 @@ def test_works_in_a_pipe_and_bad_input_exits_3(gdtool, square, tmp_path):
 
 
 def test_a_target_or_a_budget_instead_of_samples(gdtool, square, tmp_path):
-    """A target in reach is met and estimated; one out of reach in so little time is not, and the picture is there."""
+    """A low target is met. A high one is not met within a short budget, but the picture is there."""
     small = ("--size", "32", "--light-samples", "2")
     for target in (25, 45):
         assert gdtool("relight", square, *small, "--target-psnr", str(target), "-o", f"t{target}").returncode == 0

@@ -47,7 +47,7 @@ def box(tmp_path):
 
 @pytest.fixture
 def gdtool(gdtool_here):
-    """Within this process, but for the tests that ask for the command itself."""
+    """Run commands within this process, except in tests that ask for the command itself."""
     return gdtool_here
 
 
@@ -89,7 +89,7 @@ def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp
 
 
 def test_turned_objects_look_as_from_a_turned_camera(gdtool, box, tmp_path):
-    """The frame says how far each was turned; their smooth normals turn with them."""
+    """source_from_world records each turn, and smooth normals turn with the object."""
     ball = trimesh.creation.icosphere(2)
     ball.apply_scale((1.0, 1.5, 0.5))
     ball.vertex_normals  # noqa: B018 - written with the file
@@ -253,7 +253,7 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
 
 
 def test_goes_on_after_a_kill(gdtool, box, tmp_path):
-    """Killed while it works on the second of three: the first is kept, nothing half-written is left or listed."""
+    """Killed while it renders the second of three: the first is kept, no half-written folder is left or listed."""
     for name in "abc":
         (tmp_path / f"{name}.obj").write_text(BOX)
     arguments = (*(tmp_path / f"{name}.obj" for name in "abc"), *FAST, "--domains", "normal", "-o", "data")
@@ -276,8 +276,7 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
-    """Resident memory after twelve rounds over five objects is that after four: what a run took is given back, or used
-    again."""
+    """Resident memory after twelve rounds over five objects is that after four."""
     from gdtool.core import log
     from gdtool.core.runner import Settings, run_all
     from gdtool.stages.render_dataset import STAGE, Options
@@ -305,7 +304,7 @@ def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
 
 
 def test_either_reflection_model(gdtool, box, tmp_path):
-    """closed_form and color follow --brdf; what is not lit does not."""
+    """closed_form and color follow --brdf; unlit images do not."""
     views = {}
     for brdf in ("gltf", "paper"):
         assert (

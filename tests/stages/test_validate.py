@@ -26,7 +26,7 @@ def good(tmp_path_factory):
 
 
 def large(path):
-    """A glTF triangle with a texture of more pixels a side than gdtool opens."""
+    """Write a glTF triangle with a texture of more pixels a side than gdtool opens."""
     Image.new("RGB", (16_400, 1)).save(path.with_suffix(".png"))
     points = struct.pack("<9f", 1, 0, 0, 0, 1, 0, 0, 0, 1)
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
@@ -109,7 +109,7 @@ def test_inputs_that_do_not_match_the_key_are_a_fault(tmp_path):
 
 
 def test_a_key_follows_the_content_of_a_file_option(tmp_path):
-    """An option that names a file enters the key by digest; once the file is gone that cannot be checked."""
+    """The digest of the file is part of the key; without the file the key cannot be checked."""
     write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32))
     options = relight.Options(env="sky.exr", views=1, size=16, samples=1, light_samples=1)
     triangles = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]]).astype(np.int32)
