@@ -1,5 +1,4 @@
-"""The gdtool command line. Nothing but signals and the list of commands is imported before main() listens to
-signals."""
+"""Run the gdtool command line. Before main() listens to signals, only signals and the list of commands are imported."""
 
 from __future__ import annotations
 
@@ -32,14 +31,17 @@ COMPLETION = "_GDTOOL_COMPLETE"
 
 
 def _cli() -> click.Command:
+    """Import the group of all commands."""
     from ._group import cli
 
     return cli
 
 
 def main(load: Callable[[], click.Command] = _cli) -> None:
-    """Run the click command that load() gives, which may import what it likes, and exit with one of the documented
-    codes."""
+    """Run the click command that load() returns, and exit with one of the documented codes.
+
+    load() may import anything.
+    """
     _open_streams()
     # Files that a umask would close to their own user could not be finished, nor removed.
     os.umask(os.umask(0o077) & 0o077)
@@ -49,7 +51,7 @@ def main(load: Callable[[], click.Command] = _cli) -> None:
 
     ending.listen()  # before click and all else: Ctrl-C is quiet from the start
     try:
-        from ._common import guarded
+        from ._exit import guarded
 
         command = load()
         if COMPLETION in os.environ:
@@ -70,8 +72,10 @@ def main(load: Callable[[], click.Command] = _cli) -> None:
 
 
 def _open_streams() -> None:
-    """Open /dev/null in the place of standard streams that the caller closed: a file of the user's would get their
-    numbers."""
+    """Open /dev/null in place of standard streams that the caller closed.
+
+    Else a file of the user's would get the number of one of them.
+    """
     for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
         try:
             os.fstat(number)

@@ -1,4 +1,4 @@
-"""The group of all commands: it imports a command only when it is named."""
+"""Define the group of all commands, which imports a command only when it is named."""
 
 from __future__ import annotations
 
@@ -21,32 +21,35 @@ HELP = """One image, or one PBR model, to an engine-ready 3D asset.
 
 
 class LazyGroup(click.Group):
-    """Commands of COMMANDS and of the entry point group gdtool.commands, each loaded when it is asked for."""
+    """Find commands in COMMANDS and in the entry point group gdtool.commands, and load them on demand."""
 
     def list_commands(self, ctx):
+        """List gdtool's commands, then those of plugins."""
         return [*COMMANDS, *sorted(set(_plugins()) - set(COMMANDS))]
 
     def get_command(self, ctx, name):
+        """Load a command; None for an unknown name."""
         if name in COMMANDS:
             return importlib.import_module("." + name.replace("-", "_"), __package__).command
         plugin = _plugins().get(name)
         return _loaded(plugin) if plugin else None
 
     def format_commands(self, ctx, formatter):
+        """Write the section of the help that lists the commands, without loading them."""
         plugins = {name: "(plugin)" for name in _plugins() if name not in COMMANDS}
         with formatter.section("Commands"):
             formatter.write_dl(list((COMMANDS | plugins).items()))
 
 
 def _plugins():
+    """Find the entry points of plugins by name."""
     from importlib.metadata import entry_points
 
     return {point.name: point for point in entry_points(group="gdtool.commands")}
 
 
 def _loaded(plugin) -> click.Command:
-    """Return the command that an entry point names. Raises ResourceError where it cannot be imported or is no
-    command."""
+    """Load the command of an entry point. Raises ResourceError where it cannot be imported or is no command."""
     package = plugin.dist.name if plugin.dist is not None else plugin.module
     cure = f"pip uninstall {package}, or install a release of it that works with this gdtool"
     try:

@@ -2,6 +2,6 @@
 
 from gdtool.stages import relight as stage
 
-from ._common import help_of, stage_command
+from ._stage_command import help_of, stage_command
 
 command = stage_command(stage.STAGE, help=help_of(stage))

@@ -1,4 +1,4 @@
-"""`gdtool train`: options and help come from the stage; --plan, and the processes of torchrun that follow the first."""
+"""`gdtool train`: options and help come from the stage; adds --plan, and follows the first process of torchrun."""
 
 import os
 
@@ -6,7 +6,8 @@ import click
 
 from gdtool.stages import train as stage
 
-from ._common import build_options, help_of, stage_command
+from ._options import build_options
+from ._stage_command import help_of, stage_command
 
 command = stage_command(stage.STAGE, help=help_of(stage))
 command.params.append(
@@ -21,6 +22,7 @@ _train = command.callback
 
 
 def _invoke(*, plan: bool, **values):
+    """Plan the training, run it, or take part in it as a later process of torchrun."""
     if plan:
         click.echo(stage.plan(build_options(stage.Options, values), values["as_json"]))
         return 0

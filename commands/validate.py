@@ -12,7 +12,9 @@ from gdtool.core import ending, sources
 from gdtool.core.errors import InputError
 from gdtool.stages import validate as stage
 
-from ._common import TEXT, emit, help_of, report_text, set_verbosity, tell, verbosity_options
+from ._exit import emit, report_text, tell
+from ._options import TEXT, set_verbosity, verbosity_options
+from ._stage_command import help_of
 
 SHOWN = 10  # the first faults are enough to start mending
 
@@ -26,21 +28,21 @@ def command(paths, as_json, log_file, quiet, verbose, debug):
     code = 0
     for text in sources.incoming(paths):
         try:
-            found = list(stage.faults(Path(text)))
+            faults = list(stage.faults(Path(text)))
         except Exception as error:  # the path could not be checked, which says nothing of its validity
             if ending.received is not None:
                 raise
             code = tell(error, text).exit_code
             continue
-        if found and not code:
+        if faults and not code:
             code = InputError.exit_code
         if as_json:
-            emit(json.dumps({"path": text, "valid": not found, "faults": found}).encode() + b"\n")
+            emit(json.dumps({"path": text, "valid": not faults, "faults": faults}).encode() + b"\n")
             continue
-        for fault in found[:SHOWN]:
+        for fault in faults[:SHOWN]:
             report_text(fault)
-        if len(found) > SHOWN:
-            report_text(f"{text}: {len(found) - SHOWN} more faults (--json lists all)")
-        if not found:
+        if len(faults) > SHOWN:
+            report_text(f"{text}: {len(faults) - SHOWN} more faults (--json lists all)")
+        if not faults:
             emit(b"valid: " + os.fsencode(text) + b"\n")
     return code

@@ -47,7 +47,7 @@ def gdtool_here(tmp_path, monkeypatch):
     """As gdtool, but within this process: no second import of torch, so a tenth of the time for small work."""
 
     def run(*arguments, stdin=""):
-        from gdtool.commands._common import guarded
+        from gdtool.commands._exit import guarded
         from gdtool.commands._group import cli
 
         out, err = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True), io.StringIO()

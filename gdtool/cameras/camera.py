@@ -1,7 +1,7 @@
-"""One camera model for the whole project, and the rigs made of it.
+"""Define the camera of the whole project, its projections, and the rigs made of it.
 
-Camera axes are OpenGL's: x right, y up, the camera looks along -z. Pixel (row 0, column 0) is the top left one and
-its centre lies at (0.5, 0.5).
+Camera axes are OpenGL's: x right, y up, the camera looks along -z. Pixel (row 0, column 0) is the top left one and its
+centre lies at (0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ DISTANCE = 2.0
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole or orthographic camera.
+    """Hold a pinhole or orthographic camera.
 
-    world_from_camera (4, 4) rigid. Orthographic: the image covers [-half_width, half_width] across, square pixels.
-    Perspective: focal length fx, fy and principal point cx, cy in pixels.
-    near, far: distances along the viewing axis that bound what is seen, world units.
+    world_from_camera (4, 4): rigid. Orthographic: the image covers [-half_width, half_width] across, with square
+    pixels. Perspective: focal length fx, fy and principal point cx, cy in pixels. near, far: distances along the
+    viewing axis, in world units, between which the object lies.
     """
 
     name: str
@@ -48,22 +48,22 @@ class Camera:
 
     @property
     def position(self) -> np.ndarray:
-        """(3,) world."""
+        """Position (3,) in the world."""
         return self.world_from_camera[:3, 3]
 
     @property
     def backward(self) -> np.ndarray:
-        """(3,) unit, from the scene toward the camera (the camera's +z)."""
+        """Unit vector (3,) from the scene toward the camera (the camera's +z)."""
         return self.world_from_camera[:3, 2]
 
     @property
     def pixel_size(self) -> float:
-        """World units per pixel, orthographic cameras only."""
+        """World units per pixel, of orthographic cameras only."""
         return 2.0 * self.half_width / self.width
 
 
 def look_at(position, target=(0.0, 0.0, 0.0), up=(0.0, 1.0, 0.0)) -> np.ndarray:
-    """(4, 4) world_from_camera of a camera at position that looks at target with the given up direction."""
+    """Compute world_from_camera (4, 4) of a camera at position that looks at target, with the given up direction."""
     position, target, up = (np.asarray(x, np.float64) for x in (position, target, up))
     backward = position - target
     backward /= np.linalg.norm(backward)
@@ -86,8 +86,10 @@ def camera_at(
     half_width: float = HALF_WIDTH,
     fov_degrees: float | None = None,
 ) -> Camera:
-    """Return a camera on a sphere around the origin, looking at it. Angles in degrees; with fov_degrees (across)
-    perspective."""
+    """Place a camera on a sphere around the origin, looking at it.
+
+    azimuth, elevation: degrees. fov_degrees: across; with it the camera is perspective, else orthographic.
+    """
     a, e = np.radians(azimuth), np.radians(elevation)
     position = distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
     pose = look_at(position)
@@ -101,8 +103,7 @@ def camera_at(
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """Return a named rig of square cameras: "six" (the default) or "wonder3d" (same azimuths, orthographic width
-    1.35)."""
+    """Make a rig of square cameras: "six", or "wonder3d" with the same azimuths and 1.35 world units across."""
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:
         raise ValueError(f"unknown rig {name!r}; known: {', '.join(half_widths)}")
@@ -110,10 +111,11 @@ def rig(name: str, size: int) -> list[Camera]:
 
 
 def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """World-space rays through pixels: origins and unit directions, float64.
+    """Compute the rays through pixels: origins and unit directions in the world, float64.
 
-    pixels (..., 2) as (x, y) in pixel units, or None for all pixel centres, shape (h, w). Orthographic origins lie on
-    the camera plane, so the distance along an orthographic ray is the depth. In memory component by component.
+    pixels (..., 2): (x, y) in pixel units; None for all pixel centres, shape (h, w). Orthographic origins lie on the
+    camera plane, so that the distance along an orthographic ray is the depth. The arrays lie in memory component by
+    component.
     """
     if pixels is None:
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
@@ -140,7 +142,10 @@ def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, 
 
 
 def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World points (n, 3) to pixel coordinates (n, 2) as (x, y), and depth (n,) along the viewing axis."""
+    """Project world points (n, 3) to pixel coordinates (n, 2) as (x, y).
+
+    Also returns the depth (n,) along the viewing axis.
+    """
     local = (points - camera.position) @ camera.world_from_camera[:3, :3]
     depth = -local[:, 2]
     if camera.projection == "orthographic":

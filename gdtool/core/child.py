@@ -1,7 +1,8 @@
-"""Run one function in a killable child process with a time and a memory limit.
+"""Run a function in a child process with a time and a memory limit.
 
-Native mesh libraries hang, crash or call exit() on hard input; in a child that costs one attempt, not the run. A child
-gets its arguments and gives its result by pickle over pipes, and dies with its parent, however the parent ends."""
+Native mesh libraries hang, crash or call exit() on hard input. In a child that costs one attempt, not the run. A child
+gets its arguments and returns its result by pickle over pipes. It ends with its parent, however the parent ends.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +33,7 @@ _SETTINGS = {
     "MALLOC_TOP_PAD_": str(2**26),
 }
 
-# Children that import a module meanwhile and wait for a request, by that module.
+# Prepared children, by the module that they import.
 _waiting: dict[str, list[subprocess.Popen]] = {}
 
 if hasattr(os, "register_at_fork"):
@@ -40,11 +41,13 @@ if hasattr(os, "register_at_fork"):
 
 
 def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: int = 1) -> None:
-    """Have `count` children wait for begin() of `function`: they import its module, and `modules`, while this process
-    goes on."""
+    """Start `count` children that import the module of `function`, and `modules`, while this process goes on.
+
+    A later begin() of `function` uses one of them.
+    """
     module = _module_of(function)
     waiting = _waiting.setdefault(module, [])
-    with contextlib.suppress(OSError):  # then begin() starts it, and tells what fails
+    with contextlib.suppress(OSError):  # begin() then starts one, and reports what fails
         while len(waiting) < count:
             waiting.append(_started((module, *modules)))
 
@@ -54,9 +57,10 @@ def begin(
 ) -> Running:
     """Start function(*args, **kwargs) in a child process, which gets a copy of the arguments as they are now.
 
-    function: at the top level of a module. seconds: it is killed after so many. memory_mb: how much the child's address
-    space may grow beyond what it has after importing (Linux). The thread that calls this must outlive the child: the
-    system ends a child with the thread that started it."""
+    function: at the top level of a module. seconds: after so many the child is killed. memory_mb: how much the child's
+    address space may grow beyond its size after importing (Linux). The thread that calls this must outlive the child:
+    the system ends a child with the thread that started it.
+    """
     module = _module_of(function)
     waiting = _waiting.get(module)
     place = None
@@ -68,12 +72,12 @@ def begin(
 
 
 def call(function: Callable[..., Any], *args: Any, seconds: float, memory_mb: int | None = None, **kwargs: Any) -> Any:
-    """Return begin(...).result(): raises ChildFailed, or the GdtoolError that the function raised."""
+    """Run begin() and wait for the result. Raises ChildFailed, or the GdtoolError that the function raised."""
     return begin(function, *args, seconds=seconds, memory_mb=memory_mb, **kwargs).result()
 
 
 def end_waiting() -> None:
-    """End the children that were prepared and never asked for anything."""
+    """End the prepared children that no begin() has used."""
     while _waiting:
         for process in _waiting.popitem()[1]:
             process.kill()
@@ -81,8 +85,7 @@ def end_waiting() -> None:
 
 
 def _module_of(function: Callable[..., Any]) -> str:
-    """Return the name that a child imports the function's module by; of a script that is running, the name of its
-    file."""
+    """Return the name by which a child imports the function's module: for a script, the name of its file."""
     if function.__module__ != "__main__":
         return function.__module__
     main = sys.modules["__main__"]
@@ -90,7 +93,7 @@ def _module_of(function: Callable[..., Any]) -> str:
 
 
 class Running:
-    """A call under way in a child process."""
+    """Hold a call that runs in a child process."""
 
     def __init__(self, name: str, process: subprocess.Popen, request: bytes, seconds: float):
         self._name, self._process, self._timed_out = name, process, False
@@ -103,20 +106,21 @@ class Running:
         self._talk.start()
 
     def _stop(self) -> None:
+        """End the child at its time limit."""
         self._timed_out = True
         self._process.kill()
 
     def _converse(self, request: bytes) -> None:
+        """Send the request, and read the answer until the child ends."""
         self._answer, self._printed = self._process.communicate(request)
         self._timer.cancel()
 
     def kill(self) -> None:
-        """End the child, where nobody will ask for its result."""
+        """End the child, whose result is no longer needed."""
         self._process.kill()
 
     def result(self) -> Any:
-        """Wait for what the function returns. Raises the GdtoolError that it raised, and ChildFailed for everything
-        else."""
+        """Wait for the function's return value. Raises the GdtoolError that it raised, ChildFailed for all else."""
         try:
             self._talk.join()
         except BaseException:
@@ -153,7 +157,7 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
         stderr=subprocess.PIPE,
         env=_SETTINGS | os.environ,
     )
-    with contextlib.suppress(BrokenPipeError):  # it is dead already: result() says of what
+    with contextlib.suppress(BrokenPipeError):  # the child is dead already: result() says why
         assert process.stdin is not None  # a pipe
         process.stdin.write(pickle.dumps((sys.path, modules)))
         process.stdin.flush()
@@ -161,10 +165,13 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickle numpy's types by name: an array that is read would otherwise have a copy of its type, for which ufunc.at
-    has no fast loops."""
+    """Pickle numpy's types by name.
+
+    An array that is unpickled otherwise has its own copy of the type, for which ufunc.at has no fast loops.
+    """
 
     def reducer_override(self, value: Any) -> Any:
+        """Pickle a native numeric dtype as a call of numpy.dtype."""
         numpy = sys.modules.get("numpy")
         if numpy is not None and isinstance(value, numpy.dtype) and value.kind in "biufc" and value.isnative:
             return numpy.dtype, (value.str,)
@@ -172,13 +179,14 @@ class _Pickler(pickle.Pickler):
 
 
 def _pickled(value: Any) -> bytes:
+    """Pickle a value with numpy's types by name."""
     file = io.BytesIO()
     _Pickler(file, protocol=5).dump(value)
     return file.getvalue()
 
 
 def serve() -> None:
-    """Be the child: read modules to import and a request from stdin, and write the answer to stdout."""
+    """Run as the child: read modules to import and a request from stdin, and write the answer to stdout."""
     _die_with_parent()
     # Native libraries print to stdout; the answer goes out through a descriptor that they do not know.
     answer_to = os.dup(1)
@@ -187,7 +195,7 @@ def serve() -> None:
     with os.fdopen(0, "rb", closefd=False) as file:
         sys.path[:], modules = pickle.load(file)
         for module in modules:
-            with contextlib.suppress(Exception):  # told when a function of it is asked for
+            with contextlib.suppress(Exception):  # reported when one of its functions is requested
                 importlib.import_module(module)
         try:
             place, module, name, args, kwargs, memory_mb = pickle.load(file)
@@ -202,7 +210,7 @@ def serve() -> None:
 
 
 def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_mb: int | None) -> tuple[str, Any]:
-    """Run the function: "done" and its result, "error" and a GdtoolError, or "failed" and why."""
+    """Run the function; returns "done" and its result, "error" and a GdtoolError, or "failed" and the reason."""
     try:
         function: Any = importlib.import_module(module)
         for part in name.split("."):
@@ -215,14 +223,15 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
     except MemoryError:
         return "failed", "ran out of memory" if memory_mb is None else f"needs more than {memory_mb} MB"
     except ImportError as error:
-        # A shared library that the system lacks is told: a fallback would hide why the result is worse.
+        # A missing system library is reported: a fallback would hide why the result is worse.
         library = None if isinstance(error, ModuleNotFoundError) else errors.missing_library(error)
         return ("error", library) if library else ("failed", f"{type(error).__name__}: {error}")
-    except Exception as error:  # the parent knows a fallback
+    except Exception as error:  # the parent has a fallback
         return "failed", f"{type(error).__name__}: {error}"
 
 
 def _limit_memory(megabytes: int) -> None:
+    """Let the address space of this process grow by so many megabytes, and no more."""
     import resource
 
     with Path("/proc/self/statm").open() as file:
@@ -234,7 +243,7 @@ def _limit_memory(megabytes: int) -> None:
 
 
 def _die_with_parent() -> None:
-    """Have this process killed when the one that started it ends."""
+    """Ask the kernel to kill this process when its parent ends (Linux)."""
     if sys.platform == "linux":
         import ctypes
 

@@ -1,4 +1,4 @@
-"""Many sources on a Ray cluster: one task each, as many in flight as the cluster has cores for."""
+"""Run one task for each source on a Ray cluster, as many at a time as the cluster has cores for."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ AHEAD = 2
 
 
 def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: int) -> Iterator[Any]:
-    """work(text) for every text, on the cluster at address, results as they come (not in the order of texts).
+    """Run work(text) for every text on the cluster at address; yields the results in the order in which they are done.
 
     address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of
-    each task. work is pickled; it runs in this process's working folder, which all nodes must see. It returns its
-    errors; a text whose worker dies (a native crash, no memory) gives a GdtoolError. Raises ResourceError without Ray
-    or cluster."""
+    each task. work is pickled and runs in this process's working folder, which all nodes must share. It returns its
+    errors. A text whose worker dies (a native crash, no memory) yields a GdtoolError. Raises ResourceError without Ray
+    or cluster.
+    """
     ray = _connected(address)
     try:
         task = ray.remote(num_cpus=cores, max_retries=1)(_within)
@@ -40,6 +41,7 @@ def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: 
 
 
 def _connected(address: str) -> Any:
+    """Import Ray and connect it to the cluster. Raises ResourceError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
@@ -65,22 +67,24 @@ def _connected(address: str) -> Any:
 
 
 def _knock(address: str) -> None:
-    """OSError when nobody listens at HOST:PORT: Ray itself tries for minutes, and then ends the process."""
+    """Raise OSError when no process listens at HOST:PORT; Ray itself would try for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
 def _room(ray: Any, cores: int) -> int:
-    """How many tasks may be in flight now; a cluster may grow."""
+    """Return how many tasks may run now; a cluster may grow."""
     return max(int(ray.cluster_resources().get("CPU", 1)) // cores, 1) + AHEAD
 
 
 def _any_done(ray: Any, waiting: dict[Any, str]) -> bool:
+    """Tell whether a task is done, without waiting."""
     return bool(waiting) and bool(ray.wait(list(waiting), num_returns=1, timeout=0)[0])
 
 
 def _next(ray: Any, waiting: dict[Any, str]) -> Any:
+    """Wait for a task; returns its result, or a GdtoolError where its worker died."""
     (done,), _ = ray.wait(list(waiting), num_returns=1)
     text = waiting.pop(done)
     try:
@@ -93,7 +97,7 @@ def _next(ray: Any, waiting: dict[Any, str]) -> Any:
 
 
 def _within(folder: str, work: Callable[[str], Any], text: str) -> Any:
-    """Return what a worker does: everything relative is meant from the driver's folder."""
+    """Run work in the driver's folder, to which relative paths refer."""
     from gdtool.core import log
 
     log.level = log.QUIET

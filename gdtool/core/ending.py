@@ -1,9 +1,8 @@
-"""End in order when a signal asks for it: an exception in the main thread, the clean-up, and the exit code 128 +
-signal.
+"""End in order after a signal: raise an exception in the main thread, clean up, exit with 128 + signal.
 
 The exception can only be raised between two steps of Python. Where a native call keeps the main thread for longer than
 GRACE, a second thread runs the clean-up and ends the process. It cannot do so inside a native call that holds the
-interpreter's lock: nothing of Python runs until that returns.
+interpreter's lock: no Python code runs until that returns.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ _clean_ups: list[Callable[[], None]] = []
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked this process to end. A KeyboardInterrupt, so that libraries let it pass."""
+    """Tell that a signal asked this process to end. It is a KeyboardInterrupt, so that libraries do not catch it."""
 
     def __init__(self, number: int):
         self.number = number
@@ -52,9 +51,10 @@ class Stopped(KeyboardInterrupt):
 
 
 def listen() -> Callable[[], None]:
-    """Have the signals of SIGNALS raise Stopped in the main thread, once; those that the caller ignores stay ignored.
+    """Make the signals of SIGNALS raise Stopped in the main thread, once.
 
-    Returns what undoes it. Where it is done already, it does nothing, and so does what it returns.
+    Signals that the caller ignores stay ignored. Returns a function that restores the previous handlers. Where listen()
+    is active already, neither it nor the returned function does anything.
     """
     global received, _deaf
     before = {number: signal.getsignal(number) for number in SIGNALS}
@@ -82,15 +82,14 @@ def listen() -> Callable[[], None]:
 
 
 def ignore() -> None:
-    """Raise nothing from now on, where the process is about to end; the thread still ends it when that takes too
-    long."""
+    """Raise no further exception, since the process is about to end; the second thread still ends it in time."""
     global _deaf
     _deaf = True
 
 
 @contextmanager
 def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
-    """Run clean_up at the end of the block, and also where the process is ended out of a native call.
+    """Run clean_up at the end of the block, and also where the process is ended during a native call.
 
     It may run twice, at the same time from two threads.
     """
@@ -104,8 +103,7 @@ def certainly(clean_up: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Return a folder of this process in the system's folder for temporary files, removed at the end of the block
-    whatever ends it."""
+    """Make a temporary folder of this process, and remove it at the end of the block, however the block ends."""
     import shutil
     import tempfile
 
@@ -115,16 +113,15 @@ def temporary_folder() -> Iterator[Path]:
 
 
 class TimeOver(BaseException):
-    """The time limit of the work under way is over. No Exception, so that no fallback takes it for a failure of its
-    own."""
+    """Tell that the time limit is over; not an Exception, so that no fallback takes it for a failed attempt."""
 
 
 @contextmanager
 def time_limit(seconds: float, late: GdtoolError) -> Iterator[None]:
-    """Raise `late` in a block that takes longer than so many seconds, and end the process with it where a native call
-    goes on for GRACE more.
+    """Raise `late` in a block that takes longer than `seconds`.
 
-    Of the main thread; elsewhere, and where the system has no SIGALRM, there is no limit. It cannot be nested.
+    Where a native call goes on for GRACE more, the process ends with that error. The limit holds in the main thread
+    only, where the system has SIGALRM. It cannot be nested.
     """
     global _late
     if _ALARM is None or threading.current_thread() is not threading.main_thread():
@@ -143,6 +140,7 @@ def time_limit(seconds: float, late: GdtoolError) -> Iterator[None]:
 
 
 def _ring(_number: int, frame: FrameType | None) -> None:
+    """Handle SIGALRM: raise TimeOver, or try again later where an import is under way."""
     if _is_importing(frame):
         signal.setitimer(signal.ITIMER_REAL, _AGAIN)
     elif _late is not None and received is None:
@@ -150,6 +148,7 @@ def _ring(_number: int, frame: FrameType | None) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
+    """Handle the first signal: raise Stopped, or end at once where an import is under way."""
     global received
     if received is not None or _deaf:  # a second Ctrl-C does not cut the clean-up short
         return
@@ -160,6 +159,7 @@ def _stop(number: int, frame: FrameType | None) -> None:
 
 
 def _is_importing(frame: FrameType | None) -> bool:
+    """Tell whether a module is being imported at a frame."""
     while frame is not None:
         if frame.f_code.co_filename.startswith("<frozen importlib"):
             return True
@@ -168,7 +168,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def _end(number: int, code: int | None = None) -> None:
-    """Clean up and end the process here and now, with the code of a signal or another one."""
+    """Clean up and end the process now, with the code of a signal or the given one."""
     for clean_up in reversed(_clean_ups):
         with contextlib.suppress(Exception):
             clean_up()
@@ -176,6 +176,7 @@ def _end(number: int, code: int | None = None) -> None:
 
 
 def _start_thread(heard: int) -> None:
+    """Start the thread that ends the process where the main thread cannot."""
     import _thread
 
     with contextlib.suppress(RuntimeError):  # no thread to be had: a native call is then waited for
@@ -203,7 +204,7 @@ def _watch(heard: int) -> None:
 
 
 def _leave_time_to_clean_up() -> None:
-    """Where the limit of processor time is a hard one, the kernel kills without a signal to handle: be told before."""
+    """Lower the soft limit of processor time below a hard one: at the hard limit the kernel kills without a signal."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -1,5 +1,4 @@
-"""Errors that a user reads: one line that names the thing, the fact and the cure, and the exit code that goes with
-it."""
+"""Errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
 
 from __future__ import annotations
 
@@ -8,9 +7,9 @@ import re
 
 
 class GdtoolError(Exception):
-    """An error with a one-line message `subject: fact; cure` and an exit code.
+    """Hold an error with a one-line message `subject: fact; cure` and an exit code.
 
-    Raised directly it means exit 1; the subclasses have the exit codes of docs/format.md.
+    An instance of this class itself has exit code 1; the subclasses have the exit codes of docs/format.md.
     """
 
     exit_code = 1
@@ -24,31 +23,31 @@ class GdtoolError(Exception):
 
 
 class UsageError(GdtoolError):
-    """The command line asks for something that cannot be meant."""
+    """Tell that the command line asks for something impossible."""
 
     exit_code = 2
 
 
 class InputError(GdtoolError):
-    """A file, folder or manifest is not what it has to be."""
+    """Tell that a file, folder or manifest breaks the rules of its format."""
 
     exit_code = 3
 
 
 class OutputError(GdtoolError):
-    """Something cannot be read or written: permission, disk, lock."""
+    """Tell that something cannot be read or written: permission, disk, lock."""
 
     exit_code = 4
 
 
 class ResourceError(GdtoolError):
-    """A missing optional dependency or device, or a memory or time limit."""
+    """Tell that an optional dependency or a device is missing, or that a memory or time limit is reached."""
 
     exit_code = 5
 
 
 class ChildFailed(Exception):
-    """A child process crashed, ran out of time or memory, or ended without a result; str() says which."""
+    """Tell that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
 # What to do about an error of the system, by its number.
@@ -71,7 +70,7 @@ _LIMITS = {
     errno.EAGAIN: "raise the limit of processes (ulimit -u)",
     errno.ENFILE: "close other programs",
 }
-# A name that no file can have is a fault of what was given, not of the disk.
+# A name that no file can have is a fault of the input, not of the disk.
 _BAD_NAMES = {
     errno.ENAMETOOLONG: "shorten the name",
     errno.ELOOP: "remove the loop of links",
@@ -80,10 +79,11 @@ _BAD_NAMES = {
 
 
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
-    """Return the error to report for an OSError: what failed is in its file name, else in subject.
+    """Turn an OSError into an error for the user; its subject is the error's file name, else `subject`.
 
-    InputError for names that are too long or lead in a circle, ResourceError for the machine's limits, OutputError for
-    all else."""
+    InputError stands for names that are too long or lead in a circle, ResourceError for limits of the machine,
+    OutputError for all else.
+    """
     fact = error.strerror or str(error) or type(error).__name__
     fact, place = fact[0].lower() + fact[1:], error.filename or subject
     if error.errno in _BAD_NAMES:
@@ -93,7 +93,7 @@ def from_os_error(error: OSError, subject: object) -> GdtoolError:
     return OutputError(place, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
 
 
-# The Debian package that brings a shared library; these are what the packages that gdtool needs are linked with.
+# The Debian package of each shared library that gdtool's dependencies are linked with.
 _DEBIAN_PACKAGES = {
     "libGL.so.1": "libgl1",
     "libGLU.so.1": "libglu1-mesa",
@@ -114,12 +114,12 @@ _DEBIAN_PACKAGES = {
     "libfreetype.so.6": "libfreetype6",
     "libdbus-1.so.3": "libdbus-1-3",
 }
-# What the loader says where the address space, not the library, is what is missing.
+# Messages of the loader where it lacks address space, not the library.
 _NOT_MAPPED = re.compile(r"failed to map segment|cannot allocate memory|cannot create shared object descriptor", re.I)
-# How much an allocation that failed asked for, in the words of numpy and of torch.
+# The size in a message about a failed allocation, of numpy or of torch.
 _ASKED = re.compile(r"(?:unable|tried) to allocate ([\d.]+) ?(bytes|[KMGT]i?B)", re.I)
 _NO_LIBRARY = re.compile(r"([\w+.-]+\.so[.\d]*): cannot open shared object file")
-# What torch, OpenCV and C++ say when memory runs out; numpy and Python raise MemoryError.
+# Messages of torch, OpenCV and C++ when memory runs out; numpy and Python raise MemoryError.
 _NO_MEMORY = re.compile(
     r"out of memory|bad_alloc|can't allocate memory|not enough memory|insufficient memory|failed to allocate|unable "
     r"to allocate",
@@ -133,24 +133,23 @@ _MOST_SHOWN = 200  # characters of another program's message
 
 
 def first_line(error: BaseException) -> str:
-    """Return what an exception says, cut to a part of a line."""
+    """Return the first line of an exception's message, shortened."""
     return (str(error).strip() or "no message").splitlines()[0][:_MOST_SHOWN]
 
 
 def missing_library(error: ImportError) -> GdtoolError | None:
-    """Return the error to report for an import that lacks a shared library of the system or a Python package; None for
-    any other.
+    """Turn an ImportError for a missing system library or Python package into an error for the user.
 
-    A module of gdtool that cannot be imported is a fault of gdtool.
+    Returns None for any other ImportError: a module of gdtool that cannot be imported is a fault of gdtool.
     """
-    found = _NO_LIBRARY.search(str(error))
-    if found:
+    library = _NO_LIBRARY.search(str(error))
+    if library:
         needed_by = (error.name or "").partition(".")[0]
-        package = _DEBIAN_PACKAGES.get(found[1])
+        package = _DEBIAN_PACKAGES.get(library[1])
         return ResourceError(
-            found[1],
+            library[1],
             "is not installed" + (f", and {needed_by} needs it" if needed_by else ""),
-            f"apt install {package}" if package else f"install the system package that holds {found[1]}",
+            f"apt install {package}" if package else f"install the system package that holds {library[1]}",
         )
     if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition(".")[0] != "gdtool":
         return ResourceError(error.name, "is not installed", "pip install gdtool, which brings what it needs")
@@ -158,56 +157,57 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 
 
 def from_exception(error: Exception, subject: object) -> GdtoolError:
-    """Return the error to report for anything that was raised while working on subject.
+    """Turn any exception that was raised while working on subject into an error for the user.
 
-    GdtoolError: itself. OutputError, InputError or ResourceError for what the system, the memory, a device or a missing
-    library does. A GdtoolError with exit code 1, "internal error", for all else."""
+    A GdtoolError stays. Faults of the system, the memory, a device or a missing library become OutputError, InputError
+    or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
+    """
     if isinstance(error, GdtoolError):
         return error
-    found: GdtoolError | None = None
+    problem: GdtoolError | None = None
     first = first_line(error)
     native = isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] in ("cv2", "torch", "scipy")
     if isinstance(error, MemoryError) or native and _NO_MEMORY.search(str(error)):
-        found = ResourceError(subject, "ran out of memory" + asked_for(error), "lower the resolution or free memory")
+        problem = ResourceError(subject, "ran out of memory" + asked_for(error), "lower the resolution or free memory")
     elif isinstance(error, OSError):
-        found = from_os_error(error, subject)
+        problem = from_os_error(error, subject)
     elif isinstance(error, ImportError) and is_unmapped(error):
-        found = ResourceError(
+        problem = ResourceError(
             subject,
             f"ran out of memory while {error.name or 'a library'} was loaded",
             "free memory or raise its limit (ulimit -v)",
         )
     elif isinstance(error, ImportError):
-        found = missing_library(error)
+        problem = missing_library(error)
     elif isinstance(error, ChildFailed):
-        found = ResourceError(subject, f"a step of it failed ({first})", "free memory, or give it a smaller input")
+        problem = ResourceError(subject, f"a step of it failed ({first})", "free memory, or give it a smaller input")
     elif native and _NO_THREAD.search(str(error)):
-        found = ResourceError(
+        problem = ResourceError(
             subject,
             f"cannot start a thread ({first})",
             "raise the limit of processes (ulimit -u) or of memory (ulimit -v)",
         )
     elif isinstance(error, (RuntimeError, AssertionError)) and _NO_DEVICE.search(str(error)):
-        found = ResourceError(subject, f"the device failed ({first})", "run it on the cpu")
-    return found or internal_error(error, subject)
+        problem = ResourceError(subject, f"the device failed ({first})", "run it on the cpu")
+    return problem or internal_error(error, subject)
 
 
 def is_unmapped(error: BaseException) -> bool:
-    """Whether an import failed because there was no memory to load a library into."""
+    """Tell whether an import failed because there was no memory to load a library into."""
     return bool(_NOT_MAPPED.search(str(error)))
 
 
 def asked_for(error: BaseException) -> str:
-    """How much the allocation that failed asked for, in parentheses; empty where the message does not say."""
-    found = _ASKED.search(str(error))
-    if not found:
+    """Return the size of the allocation that failed, in parentheses; empty where the message does not say."""
+    request = _ASKED.search(str(error))
+    if not request:
         return ""
-    amount, unit = float(found[1]), found[2]
+    amount, unit = float(request[1]), request[2]
     return f" (it asked for {amount / 2**30:.2f} GiB)" if unit == "bytes" else f" (it asked for {amount:g} {unit})"
 
 
 def internal_error(error: BaseException, subject: object) -> GdtoolError:
-    """Return the error to report for a fault of gdtool itself."""
+    """Make the error that reports a fault of gdtool itself."""
     return GdtoolError(
         subject,
         f"internal error ({type(error).__name__}: {first_line(error)})",

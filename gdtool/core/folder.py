@@ -1,4 +1,4 @@
-"""Folders that stages read: opening and checking."""
+"""Open the folders that stages read, and check them against the format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ContentT = TypeVar("ContentT", bound=Content)
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder with a manifest."""
+    """Hold a folder's path and its manifest."""
 
     path: Path
     manifest: Manifest
@@ -29,7 +29,7 @@ class Folder:
 
     @property
     def content(self) -> Content:
-        """What the manifest says that the folder holds."""
+        """The part of the manifest that describes what the folder holds."""
         return self.manifest.content
 
     def content_as(self, wanted: type[ContentT]) -> ContentT:
@@ -44,20 +44,19 @@ class Folder:
         return self.manifest.name
 
     def file(self, relative: str) -> Path:
-        """Path of a file of the folder, which lies below it, links followed. Raises InputError for a name or a link
-        that leads elsewhere."""
+        """Return the path of a file below the folder. Raises InputError for a name or a link that leads elsewhere."""
         return path_inside(self.path, relative, self.path / MANIFEST, "file")
 
 
 def is_folder(path: Path) -> bool:
-    """Whether path is a folder with a manifest."""
+    """Tell whether path is a folder with a manifest."""
     return (path / MANIFEST).is_file()
 
 
 def open_folder(path: Path | str, kinds: tuple[str, ...] = (), reader: str = "", check: bool = True) -> Folder:
-    """Open a folder and check it against the format, its kind against kinds, its files against the manifest.
+    """Open a folder and check its manifest, its kind (one of `kinds`), and its files against the manifest.
 
-    reader is the command that reads it, for the message. Raises InputError.
+    reader: name of the command that reads it, for the message. check=False leaves out the files. Raises InputError.
     """
     path = Path(path)
     if path.name == MANIFEST and path.is_file():
@@ -77,15 +76,16 @@ def open_folder(path: Path | str, kinds: tuple[str, ...] = (), reader: str = "",
 def dataset_objects(dataset: Folder) -> Iterator[Folder]:
     """Yield the views folders that a dataset lists, in its order; their files are not checked.
 
-    Raises InputError for one that leaves the dataset, is missing, or is not the one listed (another digest).
+    Raises InputError for a folder that lies outside of the dataset, is missing, or has another digest than the listed
+    one.
     """
     for entry in dataset.content_as(DatasetContent).objects:
         path = path_inside(dataset.path, entry.path, dataset.path / MANIFEST, "object")
-        found = open_folder(path, ("views",), "a dataset", check=False)
-        if found.manifest.digest != entry.digest:
+        views = open_folder(path, ("views",), "a dataset", check=False)
+        if views.manifest.digest != entry.digest:
             raise InputError(
                 path,
                 "is not the folder that the dataset lists (other digest)",
                 f"run gdtool render-dataset into {dataset.path} again",
             )
-        yield found
+        yield views

@@ -1,4 +1,4 @@
-"""What each kind of folder says of itself: the `content` of its manifest.
+"""Define what each kind of folder says of itself: the `content` of its manifest.
 
 These types are the format: the JSON Schemas in schemas/ are generated from them (`make schemas`), and every manifest is
 decoded through them. The files that go with them are described in schemas/<kind>.md.

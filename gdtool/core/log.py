@@ -1,5 +1,4 @@
-"""Tell what a run does: one line an event on stderr, all lines with their times in a file, and bars only on a
-terminal."""
+"""Show the progress of a run: one line per event on stderr, all lines with times in a file, bars on a terminal only."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ _file: TextIO | None = None
 
 
 def keep_in(path: Path) -> None:
-    """Append each line from now on, whatever the verbosity, to a file, with its time. Raises OutputError."""
+    """Append each line from now on to a file, with its time and whatever the verbosity. Raises OutputError."""
     global _file
     try:
         _file = path.open("a", encoding="utf-8", errors="backslashreplace")
@@ -27,12 +26,12 @@ def keep_in(path: Path) -> None:
 
 
 def printable(text: str) -> str:
-    """text as one line: control characters and line breaks escaped, bytes of names that are not UTF-8 as replacement
-    characters."""
+    """Convert text to one line: escape control characters and line breaks, replace bytes that are not UTF-8."""
     return "".join(_shown(c) for c in text)
 
 
 def _shown(character: str) -> str:
+    """Escape a character that would break a line; replace a lone surrogate."""
     code = ord(character)
     if 0xD800 <= code < 0xE000:
         return "\ufffd"
@@ -42,9 +41,9 @@ def _shown(character: str) -> str:
 
 
 def line(text: str, shown: bool = True) -> None:
-    """Print text to stderr as one line, where shown, and keep it in the file of keep_in().
+    """Print text to stderr as one line, and append it to the file of keep_in().
 
-    Where stderr or the file cannot be written (closed, on a full disk) the work goes on.
+    A stderr or a file that cannot be written (closed, on a full disk) does not stop the work.
     """
     if shown:
         with contextlib.suppress(OSError, ValueError):
@@ -61,8 +60,7 @@ def say(text: str, at: int = NORMAL) -> None:
 
 
 def status(text: str) -> None:
-    """Tell how a step gets on: a line on stderr when verbose, else, on a terminal, a line that the next one
-    replaces."""
+    """Show how far a step is: as a line on stderr when verbose, else on a terminal as a line that the next replaces."""
     say(f"    {text}", at=VERBOSE)
     if level == NORMAL and sys.stderr.isatty():
         with contextlib.suppress(OSError, ValueError):

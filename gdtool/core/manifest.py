@@ -1,4 +1,7 @@
-"""manifest.json: what a folder holds, what it was made from and how. A folder with a manifest is whole."""
+"""Read, check and write manifest.json: what a folder holds, what it was made from and how.
+
+A folder gets its manifest last. So a folder with a manifest is complete.
+"""
 
 from __future__ import annotations
 
@@ -80,24 +83,24 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
     @property
     def digest(self) -> str:
-        """sha256 of what the folder holds: kind, format, content and files; not how or when it was made."""
+        """sha256 of the folder's kind, format, content and files; neither time nor options are part of it."""
         return digest_of([self.format, self.kind, self.content, sorted((f.path, f.sha256) for f in self.files)])
 
 
 def digest_of(value: Any) -> str:
-    """sha256 of the canonical JSON of value."""
+    """Compute the sha256 of the canonical JSON of a value."""
     text = json.dumps(msgspec.to_builtins(value), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def file_sha256(path: Path) -> str:
-    """sha256 of a file's bytes."""
+    """Compute the sha256 of a file's bytes."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def encode(manifest: Manifest) -> bytes:
-    """Return the bytes of manifest.json: indented, in field order, one trailing newline."""
+    """Encode a manifest as indented JSON, in field order, with one trailing newline."""
     try:
         return msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n"
     except UnicodeEncodeError:
@@ -106,11 +109,11 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def _nearest(message: str, types: tuple[type[msgspec.Struct], ...]) -> str:
-    """Return a hint for msgspec's unknown field message: the known field nearest to the unknown one."""
+    """Suggest the known field that is nearest to the unknown one of msgspec's message; empty for other messages."""
     unknown = re.search(r"unknown field `([^`]+)`", message)
     if not unknown:
         return ""
-    known = {field for one in types for field in one.__struct_fields__}
+    known = {field for struct in types for field in struct.__struct_fields__}
     near = difflib.get_close_matches(unknown[1], known, n=1)
     return f"did you mean {near[0]!r}?" if near else ""
 
@@ -132,8 +135,8 @@ def decode(raw: Any, path: Path) -> Manifest:
             path, fact[0].lower() + fact[1:], _nearest(fact, nested) or "see docs/format.md for the fields"
         ) from None
     checked_name(manifest.name, path, "name")
-    for one in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
-        relative_parts(one, path, "file path")
+    for relative in (*(entry.path for entry in manifest.files), *_files_named_in(content)):
+        relative_parts(relative, path, "file path")
     for view in getattr(content, "views", ()):
         checked_name(view, path, "view")
     for entry in manifest.inputs:
@@ -143,7 +146,7 @@ def decode(raw: Any, path: Path) -> Manifest:
 
 
 def _files_named_in(content: Content) -> Iterator[str]:
-    """Paths below the folder that its content names besides those of `files`."""
+    """Yield the paths below the folder that its content names besides those of `files`."""
     yield from (entry.path for entry in getattr(content, "objects", ()))
     yield from getattr(content, "maps", {}).values()
     yield from getattr(content, "lods", ())
@@ -151,7 +154,7 @@ def _files_named_in(content: Content) -> Iterator[str]:
 
 
 def read_manifest(folder: Path) -> Manifest:
-    """Return the manifest of a folder. Raises InputError when there is none or it is faulty."""
+    """Read the manifest of a folder. Raises InputError when there is none or it is faulty."""
     path = folder / MANIFEST
     if not path.is_file():
         fact = (
@@ -180,12 +183,12 @@ def check_files(folder: Path, manifest: Manifest) -> None:
 
 
 def _maker(manifest: Manifest) -> str:
-    """Return what wrote a folder, for a message."""
+    """Name the command or program that wrote a folder, for a message."""
     return f"gdtool {manifest.stage}" if manifest.key else "the program that wrote it"
 
 
 def list_files(folder: Path) -> tuple[FileEntry, ...]:
-    """Entries for all files below folder except the manifest, sorted by path."""
+    """List all files below a folder except the manifest, sorted by path."""
     out = []
     for root, _, names in os.walk(folder):
         for name in names:

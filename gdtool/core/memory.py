@@ -1,7 +1,7 @@
-"""How much memory the content of one input may take, judged before it is read.
+"""Limit the memory that the content of one input may take, before it is read.
 
 A small file can stand for a large result: a compressed picture, a mesh that many nodes use, a sparse archive. Readers
-predict the bytes they are going to hold, copies included, and ask here first.
+predict the bytes that they will hold, copies included, and ask here first.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ import os
 
 from gdtool.core.errors import ResourceError
 
-# What is read is held beside what is made from it: half is left to the stage.
+# The other half is left to the stage, which holds the input and the result at the same time.
 SHARE = 0.5
 
 
 def most_held() -> int:
-    """Bytes that one input may take: SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS)
-    where that is smaller."""
+    """Return the bytes that one input may take.
+
+    They are SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS) where that is smaller.
+    """
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
         import resource
@@ -27,9 +29,9 @@ def most_held() -> int:
 
 
 def require_memory(size: int, subject: object, what: str, cure: str, most: int | None = None) -> None:
-    """Raise ResourceError, with the prediction, when size bytes are more than one input may take.
+    """Raise ResourceError, with the prediction, when `size` bytes are more than one input may take.
 
-    subject: the input; what: the part of it that would take them. most: a smaller limit in bytes than most_held().
+    subject: the input. what: the part of it that would take them. most: a smaller limit in bytes than most_held().
     """
     limit = most_held() if most is None else min(most, most_held())
     if size > limit:

@@ -1,7 +1,8 @@
 """Turn names that stand inside files into paths, and refuse those that lead elsewhere.
 
-A manifest, a dataset index, an archive, a glTF or an OBJ comes from a stranger. A name in it becomes a path only
-through path_inside(), so that no file outside the folder it belongs to is ever read or written."""
+A manifest, a dataset index, an archive, a glTF or an OBJ may come from anyone. A name in it becomes a path only through
+path_inside(), so that no file outside of its folder is ever read or written.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +25,11 @@ _BYTE_ESCAPES = range(0xDC80, 0xDD00)
 
 
 def text_fault(text: str, byte_escapes: bool = False) -> str | None:
-    """Return what makes text unfit to be a name or a line of output; None where nothing does.
+    """Say why text cannot be a name or a line of output; None where it can.
 
-    NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which stand for
-    the bytes of a name on disk that is not UTF-8."""
+    Refused are NUL, control characters (C0, DEL, C1) and lone surrogates. byte_escapes: accept U+DC80 to U+DCFF, which
+    stand for the bytes of a name on disk that is not UTF-8.
+    """
     for character in text:
         code = ord(character)
         if code == 0:
@@ -40,7 +42,7 @@ def text_fault(text: str, byte_escapes: bool = False) -> str | None:
 
 
 def name_fault(text: str, byte_escapes: bool = False) -> str | None:
-    """Return what makes text unfit to be one component of a path; None where nothing does."""
+    """Say why text cannot be one component of a path; None where it can."""
     if not text:
         return "is empty"
     if text in (".", ".."):
@@ -56,9 +58,9 @@ def name_fault(text: str, byte_escapes: bool = False) -> str | None:
 
 
 def checked_name(text: str, subject: object, what: str) -> str:
-    """text, which names one file, folder or object and nothing below or above it.
+    """Return text where it is a single component of a path. Raises InputError.
 
-    subject: the file that the name stands in, and what: what it names there, for the message. Raises InputError.
+    subject: the file that the name stands in. what: what it names there. Both are for the message.
     """
     fault = name_fault(text)
     if fault:
@@ -69,11 +71,12 @@ def checked_name(text: str, subject: object, what: str) -> str:
 def path_inside(
     folder: Path, relative: str, subject: object, what: str, *, levels_up: int = 0, byte_escapes: bool = False
 ) -> Path:
-    """Return the path that a name inside a file stands for: folder / relative, below folder, links followed.
+    """Return folder / relative for a name inside a file, and check that it lies below folder, links followed.
 
-    relative: components with forward slashes; an absolute one, a drive, a backslash, control characters, lone
+    relative: components with forward slashes. An absolute path, a drive, a backslash, control characters, lone
     surrogates and over-long names are refused. levels_up: how many folders above `folder` still belong to it. subject:
-    the file that holds the name; what: what it names. The path need not exist. Raises InputError."""
+    the file that holds the name. what: what it names. The path need not exist. Raises InputError.
+    """
     parts = relative_parts(relative, subject, what, levels_up=levels_up, byte_escapes=byte_escapes)
     path = folder.joinpath(*parts)
     try:
@@ -94,10 +97,9 @@ def path_inside(
 def relative_parts(
     relative: str, subject: object, what: str, *, levels_up: int | None = 0, byte_escapes: bool = False
 ) -> tuple[str, ...]:
-    """Return the components of a relative path in a file, "." left out and ".." kept. Raises InputError as
-    path_inside() does.
+    """Split a relative path in a file into components, without "." but with "..".
 
-    levels_up: how far ".." may lead above the start; None: as far as it likes.
+    levels_up: how far ".." may lead above the start; None: any distance. Raises InputError as path_inside() does.
     """
     parts: list[str] = []
     depth = 0
@@ -132,8 +134,9 @@ def relative_parts(
 def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
     """Return the path of the file that a relative URI or a customary file name in a model stands for.
 
-    It is percent-decoded first and judged then. A file that is really called as the URI is written, percent signs and
-    all, goes before; backslashes are taken for slashes. A scheme (file:, http:, C:) is refused. Raises InputError."""
+    The URI is percent-decoded first and checked then. A file whose name has the percent signs of the URI comes first.
+    Backslashes count as slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
+    """
     decoded = unquote(uri)
     for text in (uri, decoded):
         if _SCHEME.match(text):
@@ -152,13 +155,15 @@ def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: i
 
 
 def shown(text: str, most: int = 80) -> str:
-    """text in quotes for a message: escaped, and cut where it is long."""
+    """Quote text for a message: escaped, and shortened where it is long."""
     return ascii(text) if len(text) <= most else ascii(text[:most]) + "…"
 
 
 def name_from_path(text: str) -> str:
-    """Return an object's name from a file's: bytes that are not UTF-8 are read as Latin-1, and what no name may hold
-    becomes underscores."""
+    """Make an object's name from a file's.
+
+    Bytes that are not UTF-8 are read as Latin-1; characters that a name may not hold become underscores.
+    """
     plain = "".join(chr(ord(c) - 0xDC00) if ord(c) in _BYTE_ESCAPES else c for c in text)
     name = "".join("_" if c in "/\\" or text_fault(c) else c for c in plain)
     if _DRIVE.match(name):

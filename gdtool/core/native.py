@@ -1,5 +1,4 @@
-"""Packages that bring native code: import them, or say what is missing, and ask for the memory that they cannot do
-without."""
+"""Import packages with native code, report what is missing, and reserve the memory that they need."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from types import ModuleType
 
 from gdtool.core.errors import GdtoolError, ResourceError, first_line, is_unmapped, missing_library
 
-# What pip installs, where that is not the module's name.
+# Name of the package for pip, where it differs from the module's.
 _DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "fast_simplification": "fast-simplification",
@@ -33,8 +32,7 @@ def imported(module: str) -> ModuleType:
 
 
 def imported_if_installed(module: str) -> ModuleType | None:
-    """Import a module as imported() does; None where its package is not installed. For one that has an equal
-    substitute."""
+    """Import a module as imported() does; None where its package is not installed and something else can replace it."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
@@ -46,10 +44,11 @@ def imported_if_installed(module: str) -> ModuleType | None:
 
 
 def import_error(error: ImportError | OSError, module: str) -> GdtoolError | MemoryError:
-    """Return the error to report for a failed import of `module`.
+    """Turn a failed import of `module` into an error for the user.
 
-    MemoryError where there was no room for it: in a child with a memory limit that is a reason to fall back, elsewhere
-    exit code 5."""
+    It is MemoryError where there was no memory to load the library: in a child with a memory limit that is a reason to
+    fall back, elsewhere exit code 5.
+    """
     if is_unmapped(error):
         return MemoryError(f"no memory to load {module}")
     package = module.partition(".")[0]
@@ -59,17 +58,16 @@ def import_error(error: ImportError | OSError, module: str) -> GdtoolError | Mem
         if _is_of(error.name, module):
             return ResourceError(package, "is not installed", f"pip install {install}")
     else:
-        found = missing_library(ImportError(str(error), name=package))
-        if found:
-            return found
+        problem = missing_library(ImportError(str(error), name=package))
+        if problem:
+            return problem
     return ResourceError(package, f"cannot be loaded ({first_line(error)})", f"pip install --force-reinstall {install}")
 
 
 def require_address_space(size: int, what: str) -> None:
-    """Raise MemoryError when the limit on this process's address space (RLIMIT_AS) leaves less than size bytes; without
-    a limit do nothing.
+    """Raise MemoryError when the limit on this process's address space (RLIMIT_AS) leaves less than `size` bytes.
 
-    For libraries that crash where an allocation fails. what: names the memory in the message.
+    It is for libraries that crash where an allocation fails. what: names the memory in the message.
     """
     try:
         import resource
@@ -89,5 +87,5 @@ def require_address_space(size: int, what: str) -> None:
 
 
 def _is_of(missing: str | None, module: str) -> bool:
-    """Whether the module that was not found is the one asked for or a package that it is in."""
+    """Tell whether the module that was not found is the requested one, or a package that contains it."""
     return bool(missing) and (module == missing or module.startswith(f"{missing}."))

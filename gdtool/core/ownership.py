@@ -1,9 +1,8 @@
-"""Decide whether a folder at the place of an output may be replaced: only what gdtool wrote there, and nobody changed
-since.
+"""Decide whether a folder at the place of an output may be replaced.
 
-What stands at an output's place may be somebody's work. It is replaced only if it is empty, or a folder of the same
-kind that a stage wrote, with no file beside those that its manifest lists and each of those as it was written.
-`--force` does not change that."""
+It may hold somebody's work. It is replaced only if it is empty, or a folder of the same kind that a stage wrote, with
+no file besides those that its manifest lists, each as it was written. `--force` does not change that.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +18,11 @@ CURE = "name another output with -o"
 
 
 def output_place(path: Path) -> Path:
-    """Where an output really lies: path, or what the link at path points to. A link is followed once, and stays.
+    """Return where an output really lies: path, or the place that a link at path points to.
 
-    Raises UsageError for a link to a link, a name that holds a line break, another control character or NUL, and for
-    anything at the place that is no folder."""
+    A link is followed once, and stays. Raises UsageError for a link to a link, for a name with a line break, another
+    control character or NUL, and for anything at the place that is not a folder.
+    """
     fault = text_fault(str(path), byte_escapes=True)
     if fault:
         raise UsageError(ascii(str(path)), fault, CURE)
@@ -37,8 +37,10 @@ def output_place(path: Path) -> Path:
 
 
 def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
-    """Raise UsageError where the output is one of the sources, holds one, or lies inside one: it would erase or change
-    what it is made from."""
+    """Raise UsageError where the output is one of the sources, contains one, or lies inside one.
+
+    The run would delete or change its own input.
+    """
     here = place.resolve()
     for source in sources:
         there = source.resolve()
@@ -51,8 +53,7 @@ def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
 
 
 def refuse_loss(place: Path, kind: str) -> None:
-    """Raise UsageError, naming the file, where replacing the folder at place by a result of this kind would lose
-    something of the user's.
+    """Raise UsageError, naming the file, where a result of this kind would replace something of the user's.
 
     Reads every listed file, to compare its digest.
     """
@@ -82,8 +83,7 @@ def refuse_loss(place: Path, kind: str) -> None:
 
 
 def refuse_index(root: Path) -> None:
-    """Raise UsageError where root has a manifest.json that is no dataset index of gdtool's: writing the index would
-    lose it."""
+    """Raise UsageError where root has a manifest.json that is not a dataset index written by gdtool."""
     if not (root / MANIFEST).exists():
         return
     manifest = _own_manifest(root, [MANIFEST])
@@ -92,6 +92,7 @@ def refuse_index(root: Path) -> None:
 
 
 def _own_manifest(place: Path, present: list[str]) -> Manifest:
+    """Read the manifest of a folder that a run would replace. Raises UsageError where there is none of gdtool's."""
     if MANIFEST not in present:
         raise UsageError(place / present[0], "is in the way, and gdtool did not write that folder", CURE)
     try:
@@ -101,7 +102,7 @@ def _own_manifest(place: Path, present: list[str]) -> Manifest:
 
 
 def _files_below(folder: Path) -> list[str]:
-    """All that is no plain folder below a folder, relative, sorted: files, links, and whatever else stands there."""
+    """List all entries below a folder that are not plain folders: files, links and others; relative and sorted."""
     out = []
     for root, folders, names in os.walk(folder):
         names += [name for name in folders if Path(root, name).is_symlink()]

@@ -1,7 +1,8 @@
-"""Walk back along what a folder was made from, by path and by digest.
+"""Walk from a folder to the folders and files that it was made from.
 
-A manifest says where each input lay and what it was. An input that lies there still but is another one by now is told
-and refused: what a stage would take from it does not belong to the folder at hand."""
+A manifest lists the path and the digest of each input. An input that has another digest by now raises an error: it does
+not belong to the folder any more.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from gdtool.core.names import relative_parts
 
 @dataclass(frozen=True)
 class Origin:
-    """One thing that a folder was made from, as far as it still lies where the manifest says."""
+    """Hold an input that the manifest of the folder `of` lists, and its absolute path."""
 
     of: Folder
     entry: InputEntry
@@ -27,15 +28,15 @@ class Origin:
 
     @property
     def is_gone(self) -> bool:
-        """Whether nothing lies there any more."""
+        """True where nothing lies at the path any more."""
         return not os.path.lexists(self.path)
 
     def require_same(self, cure: str) -> None:
-        """Raise InputError where what lies there now is not what the folder was made from: another digest."""
+        """Raise InputError where the input has another digest than the manifest lists."""
         kind = "source"
         if is_folder(self.path):
-            found = read_manifest(self.path)
-            kind, digest = found.kind, found.digest
+            manifest = read_manifest(self.path)
+            kind, digest = manifest.kind, manifest.digest
         else:
             digest = sources.digest(self.path)
         if digest != self.entry.digest:
@@ -43,8 +44,10 @@ class Origin:
 
 
 def origins(folder: Folder) -> Iterator[Origin]:
-    """Yield what a folder was made from, generated objects left out; paths in manifests are relative to where the
-    folder really lies."""
+    """Yield the inputs that a folder's manifest lists, without generated objects.
+
+    Paths in manifests are relative to where the folder really lies.
+    """
     for entry in folder.manifest.inputs:
         if not entry.path.startswith("procedural:"):
             parts = relative_parts(entry.path, folder.path / MANIFEST, "input", levels_up=None, byte_escapes=True)
@@ -52,11 +55,10 @@ def origins(folder: Folder) -> Iterator[Origin]:
 
 
 def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
-    """Yield the folders that this one was made from, nearest first, as far as they still lie where the manifests say; a
-    model's network is none.
+    """Yield the folders that a folder was made from, nearest first, as far as they still exist.
 
-    cure: what to do about a folder that was replaced since, for the message.
-    Raises InputError for one that was replaced since.
+    The folder of a model (a network) is not part of the chain. cure: what to do about a folder that was replaced since,
+    for the message. Raises InputError for such a folder.
     """
     queue, seen = [folder], {folder.path.resolve()}
     while queue:
@@ -65,44 +67,48 @@ def ancestors(folder: Folder, cure: str) -> Iterator[Folder]:
             if not is_folder(path) or path in seen:
                 continue
             seen.add(path)
-            if read_manifest(path).kind == "model":  # what it was made with, not what of
+            if read_manifest(path).kind == "model":  # it was made with the model, not from it
                 continue
             origin.require_same(cure)
-            # Shown as the user would write it, where the chain lies beside the folder that was given.
-            found = open_folder(Path(os.path.normpath(origin.of.path / origin.entry.path)), check=False)
-            yield found if found.path.resolve() == path else open_folder(path, check=False)
-            queue.append(found)
+            # The path as the user would write it, where the chain lies beside the folder that the user named.
+            nearby = open_folder(Path(os.path.normpath(origin.of.path / origin.entry.path)), check=False)
+            yield nearby if nearby.path.resolve() == path else open_folder(path, check=False)
+            queue.append(nearby)
 
 
 def find_ancestor(folder: Folder, kind: str, cure: str) -> Folder | None:
-    """Return the nearest folder of a kind along the provenance chain (the folder itself included), or None. Raises as
-    ancestors() does."""
+    """Return the nearest folder of a kind along the provenance chain, which starts with the folder itself; None
+    without.
+
+    Raises as ancestors() does.
+    """
     if folder.kind == kind:
         return folder
-    return next((found for found in ancestors(folder, cure) if found.kind == kind), None)
+    return next((ancestor for ancestor in ancestors(folder, cure) if ancestor.kind == kind), None)
 
 
 def missing_origin(folder: Folder, cure: str) -> Origin | None:
-    """Return the first thing along the provenance chain that lies no more where the manifests say; None where all is
-    there.
-    Raises as ancestors() does."""
-    for one in (folder, *ancestors(folder, cure)):
-        for origin in origins(one):
+    """Return the first input along the provenance chain that does not exist any more; None where all exist.
+
+    Raises as ancestors() does.
+    """
+    for member in (folder, *ancestors(folder, cure)):
+        for origin in origins(member):
             if origin.is_gone:
                 return origin
     return None
 
 
 def find_source(folder: Folder, cure: str) -> str | None:
-    """Return the first input along the chain that is not a folder: a file path, procedural:SEED, or None.
+    """Return the first input along the chain that is not a folder: a file path or procedural:SEED; None without.
 
     Raises InputError where the file or a folder on the way was replaced since; cure as for ancestors().
     """
-    for one in (folder, *ancestors(folder, cure)):
-        for entry in one.manifest.inputs:
+    for member in (folder, *ancestors(folder, cure)):
+        for entry in member.manifest.inputs:
             if entry.path.startswith("procedural:"):
                 return entry.path
-        for origin in origins(one):
+        for origin in origins(member):
             if origin.path.is_file():
                 origin.require_same(cure)
                 return str(origin.path)

@@ -1,8 +1,9 @@
-"""Atomic publishing: a folder appears whole or not at all, whatever kills the run.
+"""Publish a folder atomically: it appears complete or not at all, even where the run is killed.
 
-Beside the target `surface` live, while a run works on it: `.surface.lock`, `.surface.<key>.partial` (what is being
-written), `.surface.<key>.old` (what it replaces, for a moment, where the system cannot swap two folders) and, for
-stages that resume, `.surface.<key>.work`; <key> is the first twelve hexadecimal digits of the run's key."""
+While a run works on the target `surface`, these lie beside it: `.surface.lock`; `.surface.<key>.partial`, which the run
+writes; `.surface.<key>.old`, the replaced folder, for a moment where the system cannot swap two folders; and, for
+stages that resume, `.surface.<key>.work`. <key> is the first twelve hexadecimal digits of the run's key.
+"""
 
 from __future__ import annotations
 
@@ -28,12 +29,12 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 
 @contextmanager
 def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
-    """Hold the lock of a target; wait for another process that has it. Raises OutputError when it takes too long."""
+    """Hold the lock of a target, and wait where another process has it. Raises OutputError after wait_seconds."""
     path = target.parent / f".{target.name}.lock"
     deadline, told = time.monotonic() + wait_seconds, False
     while True:
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
-        if os.fstat(handle).st_size:  # a lock of ours is empty, and is removed in the end
+        if os.fstat(handle).st_size:  # gdtool's lock is empty, and is removed in the end
             os.close(handle)
             raise OutputError(
                 path,
@@ -67,21 +68,22 @@ KEY_DIGITS = 12  # of the key, in the names beside the target
 
 
 def partial_path(target: Path, key: str) -> Path:
-    """Where the run with this key writes."""
+    """Return the folder that the run with this key writes."""
     return _beside(target, key, "partial")
 
 
 def workspace_path(target: Path, key: str) -> Path:
-    """Where the run with this key keeps what a later run can resume from."""
+    """Return the folder in which the run with this key keeps what a later run can resume from."""
     return _beside(target, key, "work")
 
 
 def _beside(target: Path, key: str, use: str) -> Path:
+    """Return the path of one of the folders beside the target."""
     return target.parent / f".{target.name}.{key[:KEY_DIGITS]}.{use}"
 
 
 def _left_beside(target: Path, *uses: str) -> list[Path]:
-    """Folders that runs of this output, and of no other, have left beside it."""
+    """List the folders that runs of this output, and of no other, have left beside it."""
     pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
     return sorted(
         path
@@ -91,11 +93,11 @@ def _left_beside(target: Path, *uses: str) -> list[Path]:
 
 
 def clear_stale(target: Path) -> None:
-    """Remove what killed runs left half written beside the target. The lock must be held: so no run that is left of is
-    alive.
+    """Remove the half-written folders that killed runs left beside the target. The lock must be held.
 
-    Workspaces stay, those of other options too: they may hold hours of a training. clear_workspaces() removes them
-    after a publication."""
+    Under the lock no run of this output is alive. Workspaces stay, those of other options too: they may hold hours of a
+    training. clear_workspaces() removes them after a publication.
+    """
     for old in _left_beside(target, "old"):
         if target.exists():
             remove_tree(old)
@@ -106,14 +108,16 @@ def clear_stale(target: Path) -> None:
 
 
 def clear_workspaces(target: Path) -> None:
-    """Remove what runs of this output could have resumed from: it is finished. The lock must be held."""
+    """Remove the workspaces of this output, which is finished. The lock must be held."""
     for path in _left_beside(target, "work"):
         remove_tree(path)
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of our own as far as the system lets us, also where a umask has left it without permissions. A
-    link is not followed."""
+    """Remove a folder of gdtool's as far as the system permits; a link is not followed.
+
+    Folders that a umask has left without permissions are removed as well.
+    """
     if folder.is_symlink() or not folder.is_dir():
         return
 
@@ -127,8 +131,7 @@ def remove_tree(folder: Path) -> None:
 
 
 def require_replaceable(target: Path) -> None:
-    """Raise OutputError where the folder at target could not be removed once it is replaced: it, or a folder in it, is
-    closed to this user."""
+    """Raise OutputError where this user has no permission to remove the folder at target, or a folder in it."""
     for root, _, _ in os.walk(target):
         if not os.access(root, os.W_OK | os.X_OK):
             raise OutputError(
@@ -137,7 +140,7 @@ def require_replaceable(target: Path) -> None:
 
 
 def publish(partial: Path, target: Path) -> None:
-    """Put a finished folder in the target's place in one step, and remove what stood there."""
+    """Move a finished folder to the target in one step, and remove the folder that was there."""
     if not target.exists():
         partial.rename(target)
         return
@@ -151,7 +154,7 @@ def publish(partial: Path, target: Path) -> None:
 
 
 def _exchange(a: Path, b: Path) -> bool:
-    """Swap two paths atomically (renameat2); False where the system cannot."""
+    """Swap two paths atomically (renameat2); returns False where the system cannot."""
     if not sys.platform.startswith("linux"):
         return False
     try:

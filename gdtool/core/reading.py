@@ -1,4 +1,4 @@
-"""Read what a user names: regular files only, and JSON whose numbers, strings and nesting are bounded."""
+"""Read files that a user names: regular files only, and JSON with bounded numbers, strings and nesting."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SPECIAL = (
 def require_regular_file(path: Path) -> None:
     """Raise InputError unless path is a regular file or a link to one: reading a FIFO or a device may never end.
 
-    OutputError where it cannot be looked at.
+    Raises OutputError where the system does not let it be looked at.
     """
     try:
         mode = Path(path).stat().st_mode
@@ -48,10 +48,11 @@ def require_regular_file(path: Path) -> None:
 
 
 def bytes_of(path: Path) -> bytes:
-    """Return the bytes of a file that the user named.
+    """Read the bytes of a file that the user named.
 
     Raises InputError where it is no regular file, ResourceError where it is larger than one input may be, OutputError
-    where it cannot be read."""
+    where it cannot be read.
+    """
     require_regular_file(path)
     require_memory(path.stat().st_size, path, "its content", "give a smaller file")
     try:
@@ -68,9 +69,10 @@ def read_json(path: Path) -> Any:
 def parse_json(content: bytes | str, subject: object) -> Any:
     """Parse JSON strictly: lists, dicts, strings, finite floats, 64-bit integers, booleans and None.
 
-    Raises InputError that names subject and the place: for text that is not JSON, a key that appears twice, NaN and
-    infinities, numbers beyond float64 or 64 bits, nesting deeper than Python's parser goes (some 1000 levels), and
-    strings with lone surrogates that stand for no byte of a file name."""
+    Raises InputError that names subject and the place, for: text that is not JSON; a repeated key; NaN and infinities;
+    numbers beyond float64 or 64 bits; nesting beyond Python's parser (some 1000 levels); strings with lone surrogates
+    that stand for no byte of a file name.
+    """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
         value = json.loads(
@@ -91,10 +93,11 @@ def parse_json(content: bytes | str, subject: object) -> Any:
 
 
 class _Refused(Exception):
-    """A value of the JSON is not one that gdtool takes; str() says which and why."""
+    """Tell that a value of the JSON is not accepted; str() says which and why."""
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a dict of pairs. Raises _Refused for a repeated key."""
     out: dict[str, Any] = {}
     for key, value in pairs:
         if key in out:
@@ -104,12 +107,14 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
+    """Parse a 64-bit integer. Raises _Refused."""
     if len(text.lstrip("-")) > MAX_INTEGER_DIGITS or not -(2**63) <= int(text) < 2**63:
         raise _Refused(f"holds the integer {text[:24]}{'…' if len(text) > 24 else ''}, beyond 64 bits")
     return int(text)
 
 
 def _float(text: str) -> float:
+    """Parse a finite float. Raises _Refused."""
     value = float(text)
     if not math.isfinite(value):
         raise _Refused(f"holds the number {text[:24]}{'…' if len(text) > 24 else ''}, beyond double precision")
@@ -117,21 +122,24 @@ def _float(text: str) -> float:
 
 
 def _constant(text: str) -> float:
+    """Refuse NaN and infinities, which Python's parser accepts."""
     raise _Refused(f"holds {text}, which JSON has no word for")
 
 
 def _unfit_string(value: Any) -> str | None:
-    """Where a string of a parsed JSON holds a lone surrogate, and which; None where none does."""
+    """Say where a string of a parsed JSON holds a lone surrogate, and which; None where none does."""
     waiting: list[tuple[str, Any]] = [("", value)]
     while waiting:
-        place, one = waiting.pop()
-        if isinstance(one, dict):
-            waiting += [(f"{place}.{key}", inner) for key, inner in one.items()]
-            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in one if not key.isascii()]
-        elif isinstance(one, list):
-            waiting += [(f"{place}[{i}]", inner) for i, inner in enumerate(one) if isinstance(inner, (str, dict, list))]
-        elif isinstance(one, str) and not one.isascii():
-            surrogates = "".join(c for c in one if "\ud800" <= c <= "\udfff")
+        place, part = waiting.pop()
+        if isinstance(part, dict):
+            waiting += [(f"{place}.{key}", inner) for key, inner in part.items()]
+            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in part if not key.isascii()]
+        elif isinstance(part, list):
+            waiting += [
+                (f"{place}[{i}]", inner) for i, inner in enumerate(part) if isinstance(inner, (str, dict, list))
+            ]
+        elif isinstance(part, str) and not part.isascii():
+            surrogates = "".join(c for c in part if "\ud800" <= c <= "\udfff")
             fault = text_fault(surrogates, byte_escapes=True)
             if fault:
                 return f"{place.lstrip('.')} {fault}"

@@ -1,7 +1,7 @@
-"""Which files a model names: the readers open these, and the digest of a source covers these, so both ask here.
+"""Find the files that a model file names. The readers open these, and the digest of a source covers these.
 
 A .gltf names files within its own folder. An .obj, its .mtl and their textures may lie one folder higher, as in the
-customary ../textures. Nothing else is opened; names.py judges each name.
+customary ../textures. No other file is opened; names.py checks each name.
 """
 
 from __future__ import annotations
@@ -39,12 +39,13 @@ _OPTION_WORDS = {
 
 
 def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """Return the path that a name in an .obj or .mtl stands for; None for an empty name or ".", which exporters write
-    for no file.
+    """Return the path that a name in an .obj or .mtl stands for.
 
-    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes are taken
-    for slashes, and of an absolute name only the last part counts. subject, what: as in path_inside(). Raises
-    InputError for a name that leads more than one folder above the model's, links followed."""
+    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes count as
+    slashes, and of an absolute name only the last part is used. subject, what: as in path_inside(). Returns None for an
+    empty name or ".", by which exporters mean no file. Raises InputError for a name that leads more than one folder
+    above the model's, links followed.
+    """
     plain = _plain(name)
     if plain in ("", "."):
         return None
@@ -52,10 +53,10 @@ def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "")
 
 
 def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """Return the texture that a name in an .mtl stands for, as obj_file(); looked for in TEXTURE_PLACES, the first
-    where none holds it.
+    """Return the path of the texture that a name in an .mtl stands for, as obj_file() does.
 
-    Raises InputError also for a FIFO, a device or a socket.
+    It is looked for in TEXTURE_PLACES; the path in the first is returned where none has it. Raises InputError also for
+    a FIFO, a device or a socket.
     """
     first = obj_file(model, name, subject, what, folder)
     if first is None:
@@ -64,7 +65,7 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
         relative = "/".join(part for part in (folder, place, _plain(name)) if part)
         try:
             relative_parts(relative, subject, what, levels_up=OBJ_LEVELS_UP)
-        except InputError:  # this place is not the file's wish
+        except InputError:  # the name leads out of this place
             continue
         path = path_inside(model.parent, relative, subject, what, levels_up=OBJ_LEVELS_UP)
         if is_readable(path):
@@ -73,8 +74,10 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
 
 
 def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
-    """Yield the name and path of each library of an mtllib line: one name that holds spaces, or several names. Raises
-    InputError."""
+    """Yield the name and path of each library of an mtllib line: one name with spaces, or several names.
+
+    Raises InputError.
+    """
     try:
         whole = obj_file(model, line, model, "the material library")
     except InputError:
@@ -88,12 +91,12 @@ def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
 
 
 def library_folder(name: str) -> str:
-    """Return the folder of a library that an mtllib line names so, relative to the model's."""
+    """Return the folder of a library that an mtllib line names, relative to the model's."""
     return _plain(name).rpartition("/")[0]
 
 
 def map_name(words: list[str]) -> tuple[str, str | None]:
-    """Name and -imfchan of a texture statement's words, the other options left out."""
+    """Return the name and the -imfchan of a texture statement, without the other options."""
     channel, i = None, 0
     while i < len(words) and words[i] in _OPTION_WORDS:
         count = _OPTION_WORDS[words[i]]
@@ -107,8 +110,10 @@ def map_name(words: list[str]) -> tuple[str, str | None]:
 
 
 def is_readable(path: Path) -> bool:
-    """Whether path is a regular file; False for a folder and for nothing. Raises InputError for a FIFO, a device or a
-    socket."""
+    """Tell whether path is a regular file; False for a folder and where nothing lies there.
+
+    Raises InputError for a FIFO, a device or a socket.
+    """
     if not path.is_file():
         if path.exists() and not path.is_dir():
             require_regular_file(path)
@@ -117,8 +122,10 @@ def is_readable(path: Path) -> bool:
 
 
 def referred_files(path: Path) -> list[Path]:
-    """Return the regular files that a .gltf or .obj names, of those that its reader would open. Never raises: the
-    reader tells what is wrong."""
+    """List the regular files that a .gltf or .obj names and that its reader would open.
+
+    Never raises: the reader reports what is wrong.
+    """
     try:
         if not path.is_file():
             return []
@@ -132,15 +139,20 @@ def referred_files(path: Path) -> list[Path]:
 
 
 class _Uri(msgspec.Struct):
+    """Decode the URI of a buffer or an image of a .gltf."""
+
     uri: str | None = None
 
 
 class _Uris(msgspec.Struct):
+    """Decode the parts of a .gltf that name files."""
+
     buffers: list[_Uri] = []
     images: list[_Uri] = []
 
 
 def _gltf_files(path: Path) -> Iterator[Path]:
+    """Yield the files that the buffers and images of a .gltf name."""
     document = msgspec.json.decode(path.read_bytes().removeprefix(b"\xef\xbb\xbf"), type=_Uris)
     for item in (*document.buffers, *document.images):
         if item.uri is not None and item.uri[:5].lower() != "data:":
@@ -153,6 +165,7 @@ def _gltf_files(path: Path) -> Iterator[Path]:
 
 
 def _obj_files(path: Path) -> list[Path]:
+    """List the libraries of an .obj and the textures that they name."""
     libraries: dict[str, Path] = {}
     with path.open(encoding="utf-8", errors="replace") as file:
         for line in file:
@@ -178,12 +191,13 @@ def _obj_files(path: Path) -> list[Path]:
 
 
 def _plain(name: str) -> str:
-    """name without quotes, with forward slashes; of an absolute one the last part."""
+    """Return a name without quotes, with forward slashes; of an absolute one the last part."""
     plain = name.strip().strip('"').replace("\\", "/")
     return plain.rsplit("/", 1)[-1] if plain.startswith("/") or plain[1:3] == ":/" else plain
 
 
 def _is_number(word: str) -> bool:
+    """Tell whether a word is a number."""
     try:
         float(word)
     except ValueError:

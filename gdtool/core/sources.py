@@ -1,4 +1,4 @@
-"""What a command is given to work on: folders, files, procedural:SEED; their names, digests and order of arrival."""
+"""Resolve the sources of a command: folders, files, procedural:SEED; their names, digests and order of arrival."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ PICTURES = "pictures"  # a kind of source: a folder of another program, without 
 
 
 def expand(text: str) -> Iterator[str]:
-    """procedural:A..B becomes its seeds, one by one; anything else is itself. Raises UsageError for anything else after
-    procedural:."""
+    """Expand procedural:A..B to its seeds; any other text stays. Raises UsageError for a malformed range."""
     if not text.startswith("procedural:"):
         yield text
         return
@@ -47,8 +46,9 @@ def expand(text: str) -> Iterator[str]:
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     """Yield sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
-    Raises UsageError when both are empty: a pipe whose first stage failed fails as a whole. Also for what can be no
-    source, before any of the arguments is worked on."""
+    Raises UsageError when both are empty, since a pipe whose first stage failed fails as a whole. Arguments that cannot
+    be sources raise it before any of them is worked on.
+    """
     empty = True
     for text in arguments:
         next(expand(_checked(text)))
@@ -66,7 +66,7 @@ MAX_LINE_BYTES = 2**20  # of stdin; a line of --json with all that was skipped t
 
 
 def _lines() -> Iterator[str]:
-    """Yield the sources that stdin names, a line each: paths, or objects of --json. Raises UsageError."""
+    """Yield the sources of stdin, one a line: paths, or objects of --json. Raises UsageError."""
     if sys.stdin is None or sys.stdin.isatty():
         return
     for raw in iter(functools.partial(sys.stdin.buffer.readline, MAX_LINE_BYTES + 1), b""):
@@ -80,7 +80,7 @@ def _lines() -> Iterator[str]:
 
 
 def _folder_of(raw: bytes, line: str) -> str | None:
-    """Return the folder that a line of --json names; None where it names none. Raises UsageError."""
+    """Return the folder that a line of --json names; None where the line is not of that form. Raises UsageError."""
     try:
         record = parse_json(raw, "stdin")
     except InputError as error:
@@ -97,7 +97,7 @@ def _folder_of(raw: bytes, line: str) -> str | None:
 
 
 def _checked(text: str) -> str:
-    """Return a source, which has to be one line. Raises UsageError for control characters and NUL."""
+    """Return a source that is one line of text. Raises UsageError for control characters and NUL."""
     fault = text_fault(text, byte_escapes=True)
     if fault:
         raise UsageError(shown(text), fault, "rename it without that character")
@@ -134,6 +134,7 @@ def resolve(text: str, kinds: tuple[str, ...], reader: str, allow_missing: bool 
 
 
 def _words(kinds: tuple[str, ...]) -> str:
+    """Join kinds for a message."""
     return " or ".join(kind.replace("-file", " files") for kind in kinds)
 
 
@@ -141,12 +142,10 @@ HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
 
 
 def hub_folder(text: str, revision: str = "") -> str:
-    """Return the folder that a Hugging Face hub id names, downloaded once; any other text, and what exists here, is
-    itself.
+    """Return the folder of a Hugging Face hub id, downloaded once; any other text, and an existing path, stays.
 
-    revision: a branch, tag or commit there; "": its main branch.
-
-    Raises ResourceError without huggingface_hub, InputError for what the hub does not give.
+    revision: a branch, tag or commit; "": the main branch. Raises ResourceError without huggingface_hub, InputError
+    where the download fails.
     """
     if Path(text).exists() or not HUB_ID.match(text):
         return text
@@ -169,7 +168,7 @@ def hub_folder(text: str, revision: str = "") -> str:
 
 
 def name_of(source: Source) -> str:
-    """Return the object's name: of a folder what its manifest says, of a file its stem."""
+    """Return the object's name: the manifest's for a folder, the stem of a file."""
     if isinstance(source, Folder):
         return source.name
     if isinstance(source, str):
@@ -178,7 +177,7 @@ def name_of(source: Source) -> str:
 
 
 def digest(source: Source) -> str:
-    """sha256 that changes when the source's meaning does; of .gltf and .obj the files they name are part of it."""
+    """Compute a sha256 of a source's content; for .gltf and .obj it covers the files that they name."""
     if isinstance(source, Folder):
         return source.manifest.digest
     if isinstance(source, str):
@@ -192,7 +191,7 @@ def digest(source: Source) -> str:
 
 
 def relative_to(path: Path | str, folder: Path) -> str:
-    """path as seen from where folder really lies, forward slashes; procedural:SEED stays as it is."""
+    """Return path relative to where folder really lies, with forward slashes; procedural:SEED stays as it is."""
     if isinstance(path, str):
         return path
     # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead

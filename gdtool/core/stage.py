@@ -1,4 +1,4 @@
-"""What a stage is: a pure step from folders to a folder, and what it is handed to do that."""
+"""Declare what a stage is: a function from folders to a folder, with its options, inputs and output."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 
@@ -17,26 +17,23 @@ from gdtool.core.kinds import Content
 from gdtool.core.manifest import Skip
 from gdtool.core.sources import Source
 
-# What numeric options take at most: more than anybody means, so that what is asked for is finite and fits the manifest.
+# Upper bounds of numeric options: more than anybody needs, but finite and within the range of a manifest's numbers.
 MOST_SEED = 2**63 - 1  # a 64-bit integer
 MOST_SECONDS = 7 * 86400.0  # a week
 LEAST_EXPOSURE, MOST_EXPOSURE = 1e-4, 1e4  # factors on radiance, 13 stops either way
 
-# An option that names a file: its content enters the key, its path relative to the output the manifest.
+# Marks an option that names a file (msgspec.Meta's extra), or one of the stage's built-in names. The file's content
+# enters the key, its path relative to the output the manifest.
 FILE = {"file": True}
-
-
-def file_option(description: str) -> Any:
-    """Return the annotation of an option that names a file, or one of a stage's built-in names."""
-    return Annotated[str | None, msgspec.Meta(description=description, extra=FILE)]
 
 
 @dataclass(frozen=True)
 class SecondInput:
-    """An input beside the source: a flag, and when search is set found along the provenance chain without it.
+    """Declare an input beside the source: it has a flag, and with `search` is found along the provenance chain.
 
-    default: a folder that ships with gdtool, as "package/folder", taken when neither gives one. foreign: a folder of
-    another program, or an id of the Hugging Face hub, will do as well, and arrives as a Path."""
+    default: a folder that ships with gdtool, as "package/folder", where neither gives one. foreign: a folder of another
+    program, or an id of the Hugging Face hub, is accepted too, and arrives as a Path.
+    """
 
     kind: str
     required: bool = False
@@ -48,24 +45,56 @@ class SecondInput:
 
 @dataclass(frozen=True)
 class Inputs:
-    """What a run reads. second has an entry for each second input; None where there is none."""
+    """Hold what a run reads. second has an entry for each second input, None where there is none."""
 
     main: Source
     name: str
     second: dict[str, Folder | Path | None] = field(default_factory=dict)
     all: tuple[Source, ...] = ()
 
+    @property
+    def folder(self) -> Folder:
+        """The source of a stage that reads folders only. Raises TypeError for a file or a generated object."""
+        if not isinstance(self.main, Folder):
+            raise TypeError(f"{self.main} is not a folder")
+        return self.main
+
+    @property
+    def path(self) -> Path:
+        """The source of a stage that reads files, or folders of other programs. Raises TypeError for any other."""
+        if not isinstance(self.main, Path):
+            raise TypeError(f"{self.main} is not a path")
+        return self.main
+
+    @property
+    def on_disk(self) -> tuple[Folder | Path, ...]:
+        """All sources that are folders or files, without generated objects."""
+        return tuple(source for source in self.all if not isinstance(source, str))
+
+    def second_folder(self, flag: str) -> Folder | None:
+        """Return a second input that is a folder of gdtool's, or None. Raises TypeError for another program's."""
+        folder = self.second.get(flag)
+        if isinstance(folder, Path):
+            raise TypeError(f"{folder} is not a folder with a manifest")
+        return folder
+
+    def second_path(self, flag: str) -> Path | None:
+        """Return where a second input lies, whatever wrote it; None where there is none."""
+        source = self.second.get(flag)
+        return source.path if isinstance(source, Folder) else source
+
 
 @dataclass(frozen=True)
 class Stage:
-    """A stage and all that its command line, its manifest and its schema are derived from.
+    """Declare a stage; its command line, its manifest and its schema are derived from this.
 
-    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version rises when results change.
+    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version: raised when results change.
     gathers: all sources go into one run (train). dataset: several results share a root with an index. check(inputs,
-    options) is called before any work: it raises a GdtoolError for what the run would find out only later (a file that
-    an option names, a package that it needs), and takes no time. checkpoint: the file of the workspace that a later run
-    goes on from; without it a failed run leaves no workspace. networks: it runs neural networks, so that its command
-    takes --device."""
+    options): called before any work; it takes no time, and raises a GdtoolError for what the run would find out only
+    later (a file that an option names, a package that it needs). checkpoint: the file of the workspace that a later run
+    goes on from; without it a failed run leaves no workspace. networks: the stage runs neural networks, so its command
+    takes --device.
+    """
 
     name: str
     version: int
@@ -82,12 +111,12 @@ class Stage:
 
     def second(self, flag: str) -> SecondInput:
         """Return the declaration of a second input."""
-        found = self.second_inputs[flag]
-        return SecondInput(found) if isinstance(found, str) else found
+        declared = self.second_inputs[flag]
+        return SecondInput(declared) if isinstance(declared, str) else declared
 
 
 class Output:
-    """The unpublished folder a run writes into, and the record it keeps of the run."""
+    """Hold the unpublished folder that a run writes, and the record of the run."""
 
     def __init__(self, folder: Path, workspace: Path, threads: int, device: str):
         self.folder, self.place_of_workspace = folder, workspace
@@ -98,20 +127,20 @@ class Output:
         self.warnings: list[str] = []
 
     def path(self, relative: str) -> Path:
-        """Where to write a file of the result; its parents exist."""
+        """Return where to write a file of the result, and make the folders above it."""
         path = self.folder / relative
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     @property
     def workspace(self) -> Path:
-        """A folder that survives a kill and is removed when the result is published: checkpoints, caches."""
+        """Folder that survives a kill and is removed when the result is published: for checkpoints and caches."""
         self.place_of_workspace.mkdir(parents=True, exist_ok=True)
         return self.place_of_workspace
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
-        """Time a step; its seconds go into the manifest, added up when a name comes twice."""
+        """Measure the seconds of a block for the manifest; blocks of the same name are added up."""
         log.say(f"  {name}", at=log.VERBOSE)
         start = time.perf_counter()
         try:
@@ -120,12 +149,12 @@ class Output:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def skip(self, what: str, reason: str, saved_seconds: float | None = None) -> None:
-        """Record work that the scene did not need."""
+        """Record work that the scene or the options did not need."""
         self.skipped.append(Skip(what, reason, saved_seconds))
         log.say(f"  skipped {what}: {reason}", at=log.VERBOSE)
 
     def warn(self, text: str) -> None:
-        """Record a warning and tell it."""
+        """Record a warning and show it."""
         self.warnings.append(text)
         log.say(f"warning: {text}")
 

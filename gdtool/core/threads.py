@@ -1,4 +1,4 @@
-"""How many processors there are, and the same work on many parts in several threads."""
+"""Count the processors, and work on many parts in several threads."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 
 
 def cores() -> int:
-    """Processors that this process may use."""
+    """Return the number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def mapped(run: Callable, parts: list, threads: int) -> Iterator:
-    """run(part) of each part, in order, on several threads."""
+    """Yield run(part) for each part, in order, computed on several threads."""
     if threads <= 1:
         yield from map(run, parts)
         return

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from gdtool.fields.grid.refine import keep_pieces
 from gdtool.fields.views.depth_alignment import agreement, normals_fit_depth
 from gdtool.fields.views.prepared_view import PreparedView
 from gdtool.geometry.meshes import TriMesh
+from gdtool.geometry.normals import vertex_normals
 
 if TYPE_CHECKING:
     from gdtool.fields.appearance.appearance import Appearance
@@ -242,6 +243,27 @@ def use_fit(surface: Surface, views: ViewImages, look: Appearance, out: Output) 
     if "color" in views.images:
         look.light = light_record(surface.fit)
     save_field(out.path("field.safetensors"), surface.fit)
+
+
+def find_materials(
+    views: ViewImages, mesh: Surface, step: float, light: dict[str, Any] | None, seed: int, out: Output
+) -> tuple[np.ndarray, Appearance]:
+    """Find the normals (v, 3) of the mesh's vertices, and their materials and light.
+
+    step: of the grid, world units. light: the record of the views' light, where it is known.
+    """
+    from gdtool.fields.appearance.appearance import AppearanceOptions, appearance
+
+    with out.step("materials"):
+        triangles = TriMesh(mesh.vertices, mesh.faces)
+        normals = vertex_normals(triangles)
+        options = AppearanceOptions(step, light, seed)
+        look = appearance(views.cameras, views.mask, views.images, triangles, normals, options)
+    for what, reason in look.skipped:
+        out.skip(what, reason)
+    if mesh.fit is not None:
+        use_fit(mesh, views, look, out)
+    return normals, look
 
 
 def _with_depth(views: ViewImages, prepared: list[PreparedView]) -> dict[str, np.ndarray]:

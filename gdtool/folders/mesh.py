@@ -1,4 +1,4 @@
-"""Reading and writing `mesh` and `atlas` folders: quads as Wavefront OBJ (schemas/mesh.md, schemas/atlas.md)."""
+"""Read and write `mesh` and `atlas` folders: quads as Wavefront OBJ (schemas/mesh.md, schemas/atlas.md)."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def write_obj(path: Path, mesh: QuadMesh, header: tuple[str, ...] = ()) -> None:
 
 
 def read_obj(path: Path) -> QuadMesh:
-    """Read the v, vt and f lines of an OBJ of triangles and quads.
+    """Read the v, vt and f lines of an OBJ as quads and triangles.
 
-    Polygons of more corners are cut into quads and a triangle. Raises InputError for what is not so.
+    Polygons of more corners are cut into quads and a triangle. Raises InputError for a damaged file.
     """
     from gdtool.assets.obj.lines import read_lines
 
@@ -63,8 +63,10 @@ def read_obj(path: Path) -> QuadMesh:
 
 
 def _cut(sizes: np.ndarray) -> np.ndarray:
-    """Quads (q, 4), and triangles with a fourth of -1, that polygons of sizes (p,) corners are cut into, as places
-    among all corners."""
+    """Cut polygons into quads and triangles, which have -1 as fourth corner; returns (q, 4) places among all corners.
+
+    sizes (p,): the number of corners of each polygon.
+    """
     first = np.cumsum(sizes) - sizes
     pieces = (sizes - 1) // 2
     polygon = np.repeat(np.arange(len(sizes)), pieces)
@@ -81,5 +83,5 @@ def write_mesh(out: Output, mesh: QuadMesh) -> None:
 
 
 def read_mesh(folder: Folder) -> QuadMesh:
-    """Return the mesh of a mesh or atlas folder. Raises InputError."""
+    """Read the mesh of a mesh or atlas folder. Raises InputError."""
     return read_obj(folder.file("mesh.obj"))

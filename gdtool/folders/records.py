@@ -1,4 +1,4 @@
-"""The JSON records inside folders: cameras.json and light.json."""
+"""Read and write the JSON records inside folders: cameras.json and light.json."""
 
 from __future__ import annotations
 
@@ -55,6 +55,7 @@ class Light(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def _convert(path: Path, kind: type) -> Any:
+    """Read a JSON file as a msgspec type. Raises InputError."""
     try:
         return msgspec.convert(read_json(path), kind)
     except msgspec.ValidationError as error:
@@ -65,6 +66,7 @@ def _convert(path: Path, kind: type) -> Any:
 
 
 def _write(path: Path, record: Any) -> None:
+    """Write a record as indented JSON."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n")
 
 
@@ -105,7 +107,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
     records = []
     for c in cameras:
         pose = tuple(float(x) for x in c.world_from_camera.ravel())
-        own = (
+        optics = (
             {"half_width": float(c.half_width)}
             if c.projection == "orthographic"
             else {k: float(getattr(c, k)) for k in ("fx", "fy", "cx", "cy")}
@@ -119,7 +121,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
                 world_from_camera=pose,
                 near=float(c.near),
                 far=float(c.far),
-                **own,
+                **optics,
             )
         )
     _write(path, Cameras(tuple(records)))

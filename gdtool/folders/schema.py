@@ -1,4 +1,4 @@
-"""JSON Schemas of the folder format, generated from the types that gdtool itself decodes with (`make schemas`)."""
+"""Generate the JSON Schemas of the folder format from the types that gdtool itself decodes with (`make schemas`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gdtool.folders.records import Cameras, Light
 
 
 def schemas() -> dict[str, dict[str, Any]]:
-    """File name to JSON Schema (2020-12): one per kind of manifest, and the records inside folders."""
+    """Return the JSON Schemas (2020-12) by file name: one per kind of manifest, and the records inside folders."""
     out = {}
     for kind, content in CONTENTS.items():
         kinds = (content, Manifest)
@@ -36,12 +36,13 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def _document(title: str, root: dict[str, Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    """Assemble a schema document."""
     out = {"$schema": "https://json-schema.org/draft/2020-12/schema", **root, "title": title}
     return {**out, "$defs": definitions} if definitions else out
 
 
 def text(schema: dict[str, Any]) -> str:
-    """Return the text of a schema file."""
+    """Format a schema as the text of its file."""
     return json.dumps(schema, indent=1, ensure_ascii=False) + "\n"
 
 

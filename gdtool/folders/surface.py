@@ -1,4 +1,4 @@
-"""Reading and writing `surface` folders (schemas/surface.md)."""
+"""Read and write `surface` folders (schemas/surface.md)."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ _FACE = np.dtype([("count", "u1"), ("idx", "<i4", 3)])
 
 @dataclass(frozen=True)
 class Surface:
-    """A triangle mesh in the normalised frame with a material per vertex.
+    """Hold a triangle mesh in the normalised frame with a material at each vertex.
 
-    vertices (v, 3) float, faces (f, 3) int32, normals (v, 3) unit or None, albedo (v, 3) linear in [0, 1],
-    roughness, metallic and confidence (v,) in [0, 1]. views (v,) how many views see a vertex and residual (v,) the mean
-    distance of what they show there (linear albedo, else color) from what was made of it, both None where not known.
+    vertices (v, 3) float, faces (f, 3) int32, normals (v, 3) unit or None, albedo (v, 3) linear in [0, 1], roughness,
+    metallic and confidence (v,) in [0, 1]. views (v,): how many views see a vertex. residual (v,): mean difference
+    between those views (linear albedo, else color) and the vertex's value. Both are None where not known.
     """
 
     vertices: np.ndarray

@@ -1,7 +1,8 @@
-"""Reading and writing `views` folders (schemas/views.md)."""
+"""Read and write `views` folders (schemas/views.md)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -16,16 +17,16 @@ from gdtool.core.stage import Output
 from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
 
 CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
-_PASSING = 5  # copies of one domain's pictures while they are stacked, decoded and masked
+_PASSING = 5  # copies of a domain's pictures that exist at once while they are stacked, decoded and masked
 
 
 @dataclass(frozen=True)
 class Views:
-    """What k cameras see.
+    """Hold the pictures of k cameras.
 
-    images: domain to (k, h, w, 3) or (k, h, w) float32. color, albedo and closed_form are linear in [0, 1]; normal is
-    unit, in world axes; depth is the distance along the viewing axis in world units; zero where mask is zero.
-    mask (k, h, w) float32 coverage in [0, 1]. light: the record of light.json (folders.records), or None.
+    images: domain to (k, h, w, 3) or (k, h, w) float32, zero where mask is zero. color, albedo and closed_form are
+    linear in [0, 1]; normal is unit, in world axes; depth is the distance along the viewing axis in world units. mask
+    (k, h, w) float32 coverage in [0, 1]. light: the record of light.json (folders.records), or None.
     """
 
     cameras: list[Camera]
@@ -39,7 +40,7 @@ class Views:
 
 
 def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
-    """Read a views folder; domains limits what is read (those it does not hold are left out)."""
+    """Read a views folder. domains: those to read, where the folder has them; all without it."""
     from gdtool.images.color import decode_normal, linear_from_srgb
     from gdtool.images.io import read_image
 
@@ -107,10 +108,10 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
 
 
 def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
-    """Return the picture (h, w, 4), linear color and straight alpha, that a views folder was made of, and the camera it
-    looks through.
+    """Read the picture that the views were made of, and the camera that it looks through.
 
-    None where the folder holds none. Raises InputError for one that is not a whole number of times as fine as its view.
+    The picture (h, w, 4) has linear color and straight alpha. None where the folder holds none. Raises InputError for
+    one whose size is not a whole multiple of its view's.
     """
     from gdtool.images.color import linear_from_srgb, unit_range
     from gdtool.images.io import read_image
@@ -185,3 +186,12 @@ def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | No
     out.content = ViewsContent(
         views=views.names, domains=present, source_from_world=matrix, light=views.light is not None, **extra
     )
+
+
+def write_conditions(out: Output, cameras: list[Camera], pictures: Iterable[np.ndarray]) -> None:
+    """Write condition pictures (h, w, 4), sRGB with straight alpha in [0, 1], and the cameras that took them."""
+    from gdtool.images.io import write_png
+
+    for camera, picture in zip(cameras, out.progress(pictures, len(cameras), "conditions"), strict=True):
+        write_png(out.path(f"condition/{camera.name}.png"), picture)
+    write_cameras(out.path("condition.json"), cameras)

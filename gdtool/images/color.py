@@ -1,4 +1,4 @@
-"""Encodings of colours and normals in files."""
+"""Convert colors and normals between the values that files store and those that gdtool computes with."""
 
 from __future__ import annotations
 
@@ -10,27 +10,35 @@ _AT_ONCE = 1 << 15  # numbers: what is computed of them stays in the cache
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
-    """Linear values [0, 1] -> sRGB-encoded [0, 1] (IEC 61966-2-1); float32 stays float32. Negative values give 0."""
+    """Encode linear values in [0, 1] as sRGB in [0, 1] (IEC 61966-2-1).
+
+    float32 stays float32. Negative values give 0.
+    """
     x = np.asarray(linear)
     return _by_blocks(_encoded, x if x.dtype.kind == "f" else x.astype(np.float32))
 
 
 def _encoded(x: np.ndarray) -> np.ndarray:
+    """Apply the sRGB curve."""
     x = np.maximum(x, 0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
-    """sRGB-encoded [0, 1] (or uint8, uint16 as stored) -> linear [0, 1], float32 unless float64 is given."""
+    """Decode sRGB values, in [0, 1] or as stored (uint8, uint16), to linear ones in [0, 1].
+
+    The result is float32, for float64 float64.
+    """
     return _by_blocks(_decoded, unit_range(encoded))
 
 
 def _decoded(x: np.ndarray) -> np.ndarray:
+    """Apply the inverse of the sRGB curve."""
     return np.where(x <= 0.04045, x / 12.92, np.power((np.maximum(x, 0.04045) + 0.055) / 1.055, 2.4))
 
 
 def _by_blocks(curve: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
-    """curve of each of x, some at a time."""
+    """Apply a function to all values of x, as many at a time as stay in the processor's cache."""
     if x.size <= _AT_ONCE:
         return curve(x).astype(x.dtype)
     flat = x.ravel()
@@ -41,7 +49,7 @@ def _by_blocks(curve: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.n
 
 
 def unit_range(image: np.ndarray) -> np.ndarray:
-    """uint8 and uint16 as stored -> float32 [0, 1]; floats as they are."""
+    """Convert uint8 and uint16 as stored to float32 in [0, 1]; floats stay."""
     x = np.asarray(image)
     if x.dtype.kind in "ui":
         return x.astype(np.float32) / np.float32(np.iinfo(x.dtype).max)
@@ -49,15 +57,15 @@ def unit_range(image: np.ndarray) -> np.ndarray:
 
 
 def encode_normal(normal: np.ndarray) -> np.ndarray:
-    """Return unit normals (..., 3), or 0 for background -> 0.5 n + 0.5 in [0, 1]."""
+    """Encode unit normals (..., 3) as 0.5 n + 0.5 in [0, 1]; the 0 of the background becomes 0.5."""
     return 0.5 * np.asarray(normal) + 0.5
 
 
 def decode_normal(encoded: np.ndarray) -> np.ndarray:
-    """0.5 n + 0.5 (..., 3) in [0, 1] (or uint8, uint16) -> unit normals; (0, 0, 0) where the stored value is the
-    middle.
+    """Decode 0.5 n + 0.5 (..., 3), in [0, 1] or as stored (uint8, uint16), to unit normals.
 
-    Shorter than 0.02 is the middle: 8-bit storage has no exact 0.5 (128 / 255 is 0.004 off it).
+    The middle value gives (0, 0, 0), as does anything that decodes to a length below 0.02: 8-bit storage has no exact
+    0.5 (128 / 255 is 0.004 off).
     """
     n = 2 * unit_range(encoded) - 1
     length = np.linalg.norm(n, axis=-1, keepdims=True)

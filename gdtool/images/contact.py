@@ -1,7 +1,8 @@
-"""Contact sheets: many small images in one, with labels, for a human's glance."""
+"""Make contact sheets: many small images in one picture, with labels."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,11 +15,11 @@ _MARGIN = 4  # pixels between cells
 def contact_sheet(
     rows: Sequence[Sequence[np.ndarray | None]], labels_top: Sequence[str] = (), labels_left: Sequence[str] = ()
 ) -> np.ndarray:
-    """Lay images out in a table -> (h, w, 3) uint8.
+    """Arrange images in a table; returns (h, w, 3) uint8.
 
-    rows: images (h, w) or (h, w, 1..4), encoded as they are to be shown, float [0, 1] or integer; None leaves its cell
-    empty. Alpha is laid over white. Cells take the largest image's size; labels stand above the columns and left of the
-    rows in a font of about a twelfth of that.
+    rows: images (h, w) or (h, w, 1..4), encoded for display, float in [0, 1] or integer; None leaves its cell empty.
+    Transparent pixels show white. Every cell has the size of the largest image. Labels stand above the columns and left
+    of the rows, in a font of about a twelfth of that.
     """
     cells = [[None if image is None else _shown(image) for image in row] for row in rows]
     filled = [image for row in cells for image in row if image is not None]
@@ -43,7 +44,14 @@ def contact_sheet(
     return _with_text(sheet, labels, text)
 
 
+def square_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrange images in about as many rows as columns; returns (h, w, 3) uint8."""
+    columns = math.ceil(math.sqrt(len(images)))
+    return contact_sheet([images[i : i + columns] for i in range(0, len(images), columns)])
+
+
 def _shown(image: np.ndarray) -> np.ndarray:
+    """Convert an image to (h, w, 3) uint8, over white."""
     x = unit_range(image).astype(np.float32)
     x = x.reshape(*x.shape[:2], -1)
     if x.shape[2] in (2, 4):
@@ -55,6 +63,7 @@ def _shown(image: np.ndarray) -> np.ndarray:
 
 
 def _text_width(label: str, size: int) -> int:
+    """Measure the width of a label, pixels; guess where no font is found."""
     import OpenImageIO as oiio
 
     region = oiio.ImageBufAlgo.text_size(label, size)
@@ -62,7 +71,7 @@ def _text_width(label: str, size: int) -> int:
 
 
 def _with_text(sheet: np.ndarray, labels: list[tuple[int, int, str]], size: int) -> np.ndarray:
-    """sheet with labels (x, y of the top left corner, text); unlabelled where no font is found."""
+    """Draw labels (x, y of the top left corner, text) on a sheet; nothing where no font is found."""
     import OpenImageIO as oiio
 
     buffer = oiio.ImageBuf(sheet)

@@ -1,4 +1,4 @@
-"""Whole or cut short, still or animated: what an image file's own structure says before a decoder sees it."""
+"""Check the structure of an image file before a decoder sees it: is it complete, and a single still picture?"""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
-    """Raise InputError for an empty, cut or animated file, ResourceError for a huge PNG or a file beyond
-    MAX_FILE_BYTES; head is its first 64 bytes, file is open for reading.
+    """Raise InputError for an empty, truncated or animated file.
 
-    Decoders print to stderr or fill with grey where a file ends early, so this looks first.
+    Raises ResourceError for a huge PNG, or a file beyond MAX_FILE_BYTES. head: the first 64 bytes. file: open for
+    reading. Decoders print to stderr or fill with grey where a file ends early, so this looks first.
     """
     if not head:
         raise InputError(path, "is empty", COPY)
@@ -45,8 +45,10 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
 
 
 def suffix_of(head: bytes) -> str:
-    """Return the suffix that the first bytes of an image call for: OpenImageIO tries the suffix's format first, and
-    only then tells why it fails."""
+    """Return the suffix that the first bytes of an image stand for.
+
+    OpenImageIO tries the suffix's format first, and only then says why that fails.
+    """
     if head[:4] == b"RIFF":
         return ".webp" if head[8:12] == b"WEBP" else ""
     signatures = {
@@ -62,7 +64,7 @@ def suffix_of(head: bytes) -> str:
 
 
 def _check_png(path: Path, file: BinaryIO) -> None:
-    """Each chunk's length and CRC up to IEND (PNG specification, section 5)."""
+    """Check each chunk's length and CRC up to IEND (PNG specification, section 5)."""
     file.seek(len(PNG))
     while True:
         header = file.read(8)

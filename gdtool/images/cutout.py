@@ -1,5 +1,4 @@
-"""A subject on a background that is not plain, by GrabCut (Rother et al. 2004, OpenCV), and whether that can be
-trusted."""
+"""Cut a subject out of a busy background by GrabCut (Rother et al. 2004, OpenCV), and refuse an uncertain result."""
 
 from __future__ import annotations
 
@@ -13,10 +12,11 @@ AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/c
 
 
 def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
-    """Boolean mask (h, w) of the one subject inside a picture, color (h, w, 3) sRGB in [0, 1].
+    """Find the one subject inside a picture; returns a boolean mask (h, w).
 
-    The colors along the picture's frame are taken for background. Done with two widths of the frame: where the results
-    differ, the colors of subject and background do not tell them apart, and InputError is raised with `cure`.
+    color (h, w, 3): sRGB in [0, 1]. The colors along the picture's edge are taken for background, in a narrow and in a
+    wide frame. Where the two results differ, colors do not tell the subject from its background, and InputError is
+    raised with `cure`.
     """
     _, wide, agreement = both_frames(color)
     if agreement < AGREEMENT or not 0.005 < float(wide.mean()) < 0.8:
@@ -27,15 +27,17 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
 
 
 def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return what the narrow and the wide frame give, (h, w) boolean each, and their overlap (intersection over
-    union)."""
+    """Segment with the narrow and with the wide frame.
+
+    Returns both masks (h, w), boolean, and their intersection over union.
+    """
     narrow, wide = (_grabcut(color, inset) for inset in INSETS)
     either = (narrow | wide).sum()
     return narrow, wide, float((narrow & wide).sum() / either) if either else 0.0
 
 
 def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
-    """Return the largest piece of what GrabCut finds, its holes kept."""
+    """Return the largest piece of GrabCut's foreground, with its holes."""
     from scipy import ndimage
 
     cv2 = imported("cv2")
@@ -51,8 +53,8 @@ def _grabcut(color: np.ndarray, inset: float) -> np.ndarray:
         cv2.grabCut(picture, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 6, cv2.GC_INIT_WITH_MASK)
     finally:
         cv2.setNumThreads(threads)
-    found = ndimage.binary_opening((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
-    pieces, count = ndimage.label(found)
+    foreground = ndimage.binary_opening((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD))
+    pieces, count = ndimage.label(foreground)
     if not count:
-        return found
-    return pieces == 1 + int(np.argmax(ndimage.sum_labels(found, pieces, np.arange(1, count + 1))))
+        return foreground
+    return pieces == 1 + int(np.argmax(ndimage.sum_labels(foreground, pieces, np.arange(1, count + 1))))

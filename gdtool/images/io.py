@@ -1,6 +1,6 @@
-"""Reading and writing image files through OpenImageIO, with the checks its readers leave out.
+"""Read and write image files through OpenImageIO, with the checks that its readers leave out.
 
-Reading never applies a colour space: what is stored is returned. The limits keep a small file from asking for a large
+Reading never applies a colour space: it returns the stored values. The limits keep a small file from taking a large
 part of the machine's memory.
 """
 
@@ -38,9 +38,12 @@ def read_image(path: str | Path) -> np.ndarray:
     """Read an image as it is stored: (h, w, c) uint8, uint16 or float32, row 0 at the top, c = 1..4.
 
     1 channel is grey, 2 grey and alpha, 3 RGB, 4 RGBA; alpha is straight (EXR's premultiplied colours are divided).
-    Palettes are expanded, EXIF rotation is applied. Raises InputError for what is not one whole still image in grey or
-    RGB, is no regular file, or holds values that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as
-    stored, or MAX_HELD or half of the memory while it is read; OutputError when the file cannot be read."""
+    Palettes are expanded, EXIF rotation is applied.
+
+    Raises InputError for a file that is not one complete still image in grey or RGB, is not regular, or holds values
+    that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as stored, or MAX_HELD or half of the memory
+    while it is read; OutputError when the file cannot be read.
+    """
     path = Path(path)
     require_regular_file(path)
     try:
@@ -69,6 +72,7 @@ def decode_image(content: bytes, subject: str) -> np.ndarray:
 
 
 def _read(path: Path, name: str) -> np.ndarray:
+    """Read the stored pixels of a file, which OpenImageIO opens by `name`. Raises as read_image does."""
     import OpenImageIO as oiio
 
     oiio.attribute("limits:imagesize_MB", MAX_BYTES >> 20)
@@ -121,10 +125,12 @@ def _read(path: Path, name: str) -> np.ndarray:
 
 
 def _lower(text: str) -> str:
+    """Begin a message of OpenImageIO with a small letter."""
     return text[:1].lower() + text[1:]
 
 
 def _check_spec(path: Path, spec) -> None:
+    """Raise ResourceError for a header of too many pixels, InputError for CMYK, volumes and animations."""
     if spec.width > MAX_SIDE or spec.height > MAX_SIDE or spec.image_bytes() > MAX_BYTES:
         raise ResourceError(
             path,
@@ -146,8 +152,10 @@ def _check_spec(path: Path, spec) -> None:
 
 
 def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
-    """Raise ResourceError when reading so many channels, of itemsize bytes as decoded, takes more than MAX_HELD or half
-    of the memory."""
+    """Raise ResourceError when reading takes more than MAX_HELD or half of the memory.
+
+    channels: to be read, of itemsize bytes each as decoded.
+    """
     pixels = spec.width * spec.height * channels
     size = pixels * spec.format.size() + pixels * itemsize * (2 if copied else 1)
     require_memory(
@@ -156,8 +164,10 @@ def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) ->
 
 
 def _channels(path: Path, names: list[str]) -> list[int]:
-    """Which channels make grey, grey and alpha, RGB or RGBA, in that order, of whatever a multi-channel file holds
-    besides."""
+    """Return the indices of the channels that make grey, grey and alpha, RGB or RGBA, in that order.
+
+    A multi-channel file may hold others.
+    """
     if {"R", "G", "B"} <= set(names):
         wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
         return [names.index(name) for name in wanted]
@@ -169,6 +179,7 @@ def _channels(path: Path, names: list[str]) -> list[int]:
 
 
 def _check_finite(path: Path, pixels: np.ndarray) -> None:
+    """Raise InputError for the first pixel that is not finite."""
     for start in range(0, len(pixels), _ROWS):
         bad = ~np.isfinite(pixels[start : start + _ROWS])
         if bad.any():
@@ -188,7 +199,7 @@ def _divide_by_alpha(pixels: np.ndarray) -> None:
 
 
 def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
-    """Undo an EXIF orientation 1..8: the stored rows and columns, as the camera was held."""
+    """Undo an EXIF orientation 1..8, and return rows and columns as the camera was held."""
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (0,), 7: (0, 1), 8: (1,)}
     if orientation in (5, 6, 7, 8):
         # 5 is a transpose; 6 turns clockwise: flip the rows, then transpose; 8 the other way; 7 over the other
@@ -198,7 +209,7 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def quantized(image: np.ndarray, bits: int = 8) -> np.ndarray:
-    """float [0, 1] (clipped) -> uint8 or uint16, rounded to nearest; unsigned integers as they are."""
+    """Convert float in [0, 1] (clipped) to uint8 or uint16, rounded to nearest; unsigned integers stay."""
     image = np.asarray(image)
     if image.dtype in (np.uint8, np.uint16):
         return image
@@ -209,10 +220,10 @@ def quantized(image: np.ndarray, bits: int = 8) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: np.ndarray, bits: int = 8) -> None:
-    """Write (h, w) or (h, w, 1..4): float in [0, 1] at 8 or 16 bits, or uint8 and uint16 as they are; straight alpha.
+    """Write (h, w) or (h, w, 1..4) as PNG: float in [0, 1] at 8 or 16 bits, uint8 and uint16 as they are.
 
-    No colour-space chunk is written: what the numbers mean is the folder format's business. The file is read again and
-    compared; raises OutputError when it cannot be written whole.
+    Alpha is straight. No colour-space chunk is written: the folder format says what the numbers mean. The file is read
+    again and compared; raises OutputError when it cannot be written whole.
     """
     _write(
         Path(path), quantized(image, bits), "uint8" if quantized(image[:1, :1], bits).dtype == np.uint8 else "uint16"
@@ -220,10 +231,10 @@ def write_png(path: str | Path, image: np.ndarray, bits: int = 8) -> None:
 
 
 def write_exr(path: str | Path, image: np.ndarray) -> None:
-    """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR, zip-compressed; alpha given straight, stored
-    premultiplied.
+    """Write (h, w) or (h, w, 1, 3 or 4) as 32-bit float EXR with zip compression.
 
-    Read again and compared; raises OutputError, also for NaN and infinity, which readers take in many ways.
+    Alpha is given straight, and stored premultiplied. The file is read again and compared. Raises OutputError, also for
+    NaN and infinity, which readers treat in different ways.
     """
     image = np.asarray(image, np.float32)
     if not np.isfinite(image).all():
@@ -244,11 +255,12 @@ def encode_png(image: np.ndarray, bits: int = 8) -> bytes:
 
 
 def encode_pngs(images: list[np.ndarray], bits: int = 8, threads: int = 1) -> list[bytes]:
-    """encode_png of each image, several at a time: OpenImageIO leaves the interpreter's lock while it compresses."""
+    """Encode each image as write_png does, several at a time: OpenImageIO compresses outside of Python's lock."""
     return list(mapped(lambda image: encode_png(image, bits), images, min(threads, len(images))))
 
 
 def _write(path: Path, image: np.ndarray, kind: str) -> None:
+    """Write pixels of a kind ("uint8", "uint16" or "float"), and compare the file. Raises OutputError."""
     import OpenImageIO as oiio
 
     pixels = np.ascontiguousarray(image.reshape(*image.shape[:2], -1))
@@ -291,7 +303,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
 
 
 def _again(path: Path) -> np.ndarray:
-    """Return the stored pixels, before alpha is divided."""
+    """Read the stored pixels, before alpha is divided."""
     import OpenImageIO as oiio
 
     if path.suffix.lower() != ".exr":
@@ -311,7 +323,7 @@ def _again(path: Path) -> np.ndarray:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Nothing reaches stderr: OpenEXR prints each fault that it also reports, and a user reads one line."""
+    """Send nothing to stderr in a block: OpenEXR prints each fault that it also reports."""
     try:
         saved = os.dup(2)
     except OSError:  # no stderr at all
@@ -329,7 +341,7 @@ def _quiet() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _plain_name(path: Path, writing: bool = False) -> Iterator[str]:
-    """Return a name that OpenImageIO takes: itself, or where it is not UTF-8 a link to it under another name."""
+    """Yield a name that OpenImageIO accepts: the path, or a link to it where the path is not UTF-8."""
     try:
         str(path).encode()
         yield str(path)

@@ -1,5 +1,4 @@
-"""Where the subject of a picture is: its alpha, a mask given with it, what a network says, or its difference from the
-background."""
+"""Find the subject of a picture: by a mask, its alpha, a network, or its difference from the background."""
 
 from __future__ import annotations
 
@@ -13,6 +12,13 @@ from gdtool.core.errors import InputError
 from gdtool.images.color import rgba, srgb_from_linear, unit_range
 
 WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
+# Shares of the picture between which a subject is believed: less is a speck, more is no background.
+MIN_SUBJECT, MAX_SUBJECT = 0.002, 0.95
+# Lab units from the background at which a pixel is the subject: at least, and as a multiple of the background's noise.
+SUBJECT_DISTANCE, SUBJECT_NOISE = 5.0, 5
+SHADOW_WEIGHT = 0.5  # of the lightness below the background's: a soft shadow darkens without changing hue
+BORDER_SHARE = 0.03  # width of the border that the background is fitted to, as a share of the picture's side
+MAX_NOISE = 5  # Lab units; a background with more noise is not plain
 _CURE = "give a mask with --mask, a network with --matting, or cut the subject out (RGBA)"
 
 
@@ -23,14 +29,17 @@ def foreground(
     tell: Callable[[str], None] = lambda text: None,
     network: str | Path | None = None,
 ) -> np.ndarray:
-    """Coverage (h, w) float32 in [0, 1] of a picture's subject.
+    """Find the coverage (h, w) of a picture's subject, float32 in [0, 1].
 
-    image (h, w, c) as read_image gives it; mask (h, w[, c]) of the same size, brighter or more opaque is subject. In
-    this order: the mask; the picture's own alpha, unless it is opaque everywhere; the network (matting.py), where one
-    is given; segmentation against a background that is plain (a smooth gradient and soft shadows are); GrabCut against
-    one that is not. That is a guess (one in four that it does not refuse lacks or has too much:
-    docs/benchmarks/cutout.md), and `tell` is told.
-    Raises InputError, naming `subject`, for a picture or mask without a subject, or a background that it blends into.
+    image (h, w, c): as read_image returns it. mask (h, w[, c]): of the same size, the subject brighter or more opaque.
+
+    The first of these decides: the mask; the picture's alpha, unless it is opaque everywhere; the network (matting.py),
+    where one is given; segmentation where the background is plain, gradients and soft shadows included; GrabCut where
+    it is not. GrabCut guesses: one result in four that it does not refuse lacks a part or has too much
+    (docs/benchmarks/cutout.md). So `tell` gets a warning.
+
+    Raises InputError, naming `subject`, for a picture or mask without a subject, or a subject that blends into its
+    background.
     """
     image = image.reshape(*image.shape[:2], -1)
     if mask is not None:
@@ -56,6 +65,7 @@ def foreground(
 
 
 def _mask_coverage(mask: np.ndarray) -> np.ndarray:
+    """Convert a mask picture to coverage: its alpha where that has transparent parts, else its brightness."""
     pixels = np.clip(unit_range(mask), 0, 1).astype(np.float32).reshape(*mask.shape[:2], -1)
     if pixels.shape[2] in (2, 4) and pixels[..., -1].min() < 0.5:
         return pixels[..., -1]
@@ -63,24 +73,23 @@ def _mask_coverage(mask: np.ndarray) -> np.ndarray:
 
 
 def _encoded(image: np.ndarray) -> np.ndarray:
-    """sRGB (h, w, 3) in [0, 1] of a picture as read_image gives it."""
+    """Return the sRGB color (h, w, 3) in [0, 1] of a picture as read_image returns it."""
     color = rgba(image)[..., :3]
     return srgb_from_linear(np.clip(color, 0, 1)) if image.dtype.kind == "f" else color
 
 
 def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndarray:
-    """Coverage by a trained network."""
+    """Find the coverage by a trained network. Raises InputError where it finds nothing, or all of the picture."""
     from gdtool.images.matting import saliency
 
     coverage = _without_specks(saliency(_encoded(image), network)).astype(np.float32)
-    if not 0.002 < (coverage > 0.5).mean() < 0.95:
+    if not MIN_SUBJECT < (coverage > 0.5).mean() < MAX_SUBJECT:
         raise InputError(subject, f"shows {network} no subject that stands off its background", _CURE)
     return coverage
 
 
 def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Coverage by the difference from a background model fitted to the border, its edge by random walks (Grady
-    2006)."""
+    """Find the coverage by the difference from a plain background, its edge by random walks (Grady 2006)."""
     from skimage.color import rgb2lab
     from skimage.segmentation import random_walker
     from skimage.transform import resize
@@ -102,7 +111,7 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
                 lab / 20, labels, beta=200, mode="cg_j", tol=1e-3, return_full_prob=True, channel_axis=-1
             )[0]
     coverage = np.clip(_without_specks(coverage), 0, 1)
-    if (coverage > 0.5).mean() < 0.002:
+    if (coverage > 0.5).mean() < MIN_SUBJECT:
         raise InputError(subject, "shows no subject that stands off its background", _CURE)
     if scale < 1:
         coverage = resize(coverage, (height, width), order=1)
@@ -110,8 +119,10 @@ def _segmented(image: np.ndarray, subject: object, tell: Callable[[str], None]) 
 
 
 def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[[str], None]) -> np.ndarray:
-    """Labels (h, w) as of _trimap, by the difference from a plain background, else by GrabCut. lab and color (h, w, 3)
-    are one picture."""
+    """Label pixels as _trimap does, by the difference from a plain background, else by GrabCut.
+
+    lab and color (h, w, 3) are the same picture.
+    """
     fitted = _background(lab)
     if fitted is None:
         labels = _labels_without_plain_background(color, subject)
@@ -122,18 +133,18 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, tell: Callable[
         return labels
     background, spread = fitted
     difference = lab - background
-    # A soft shadow darkens without changing hue: lightness below the background's counts for less.
-    weight = np.where(difference[..., :1] < 0, 0.5, 1.0) * (1, 0, 0) + (0, 1, 1)
+    weight = np.where(difference[..., :1] < 0, SHADOW_WEIGHT, 1.0) * (1, 0, 0) + (0, 1, 1)
     distance = np.sqrt(np.square(difference * weight).sum(-1))
-    labels = _trimap(distance, max(5.0, 5 * spread), spread)
+    labels = _trimap(distance, max(SUBJECT_DISTANCE, SUBJECT_NOISE * spread), spread)
     if not (labels == 1).any():
         raise InputError(subject, "shows no subject that stands off its background", _CURE)
-    if float((labels == 1).mean()) > 0.95:
+    if float((labels == 1).mean()) > MAX_SUBJECT:
         raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
     return labels
 
 
 def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.ndarray:
+    """Label pixels as _trimap does, by GrabCut; a band along its edge is undecided."""
     from scipy import ndimage
 
     from gdtool.images.cutout import cut_out
@@ -146,19 +157,19 @@ def _labels_without_plain_background(color: np.ndarray, subject: object) -> np.n
 
 
 def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Lab (h, w, 3) of the background everywhere, and its noise: a quadratic in x and y fitted to the border.
+    """Fit a plain background to the border: a quadratic in x and y for each Lab channel.
 
-    Pixels far from the fit are left out again and again, so a subject may touch some of the border. None where no
-    such fit holds for more than half of it.
+    Returns the background's Lab (h, w, 3) and its noise. Pixels far from the fit are left out repeatedly, so a subject
+    may touch a part of the border. None where no fit holds for more than half of it.
     """
     height, width = lab.shape[:2]
     y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], -1)
     ring = np.ones((height, width), bool)
-    inset = max(2, round(0.03 * min(height, width)))
+    inset = max(2, round(BORDER_SHARE * min(height, width)))
     ring[inset:-inset, inset:-inset] = False
     samples, rows = lab[ring], basis[ring]
-    # A start that a subject on the border does not sway: the median color alone.
+    # Start with the pixels near the median color, which a subject on the border hardly changes.
     keep = np.linalg.norm(samples - np.median(samples, 0), axis=1)
     keep = keep <= max(8.0, 3 * float(np.median(keep)))
     spread = 0.0
@@ -172,14 +183,17 @@ def _background(lab: np.ndarray) -> tuple[np.ndarray, float] | None:
         keep = again
         if keep.sum() < 50:
             break
-    if keep.mean() < 0.5 or spread > 5:
+    if keep.mean() < 0.5 or spread > MAX_NOISE:
         return None
     return basis @ fit, spread
 
 
 def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
-    """Labels (h, w): 1 subject, 2 background, 0 to be decided. distance (h, w) is the colour difference from the
-    background."""
+    """Label pixels (h, w) by their colour distance (h, w) from the background.
+
+    1 is the subject, 2 the background, 0 undecided. sure: the distance above which a pixel is the subject. spread: the
+    noise of the background.
+    """
     from scipy import ndimage
 
     near = distance < sure
@@ -207,7 +221,7 @@ def _trimap(distance: np.ndarray, sure: float, spread: float) -> np.ndarray:
 
 
 def _without_specks(coverage: np.ndarray) -> np.ndarray:
-    """coverage without pieces smaller than a hundredth of the largest."""
+    """Remove pieces that are smaller than a hundredth of the largest."""
     from scipy import ndimage
 
     pieces, count = ndimage.label(coverage > 0.5)

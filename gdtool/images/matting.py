@@ -1,5 +1,4 @@
-"""A subject cut out by a network that was trained to: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime
-(gdtool[matting])."""
+"""Cut out a subject by a trained network: U²-Net (Qin et al. 2020) as an ONNX file, run by onnxruntime."""
 
 from __future__ import annotations
 
@@ -15,11 +14,14 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's 
 
 
 def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
-    """Coverage (h, w) float32 in [0, 1] of what stands out in a picture, color (h, w, 3) sRGB in [0, 1].
+    """Find the coverage (h, w) of the subject of a picture, float32 in [0, 1].
 
-    network: an .onnx file of U²-Net's structure: one picture (1, 3, s, s), normalised as ImageNet's, to maps (1, 1, s,
-    s) of which the first counts, stretched to [0, 1] as the authors do. Raises ResourceError without onnxruntime,
-    InputError for a file that is no such network or gives nothing finite."""
+    color (h, w, 3): sRGB in [0, 1]. network: an .onnx file with the structure of U²-Net. It takes one picture (1, 3, s,
+    s), normalised as ImageNet's, and returns maps (1, 1, s, s). The first one is used, stretched to [0, 1] as the
+    authors do.
+
+    Raises ResourceError without onnxruntime, InputError for a file that is no such network or returns nothing finite.
+    """
     from skimage.transform import resize
 
     onnxruntime = imported_if_installed("onnxruntime")
@@ -35,7 +37,7 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
         side = entry.shape[-1] if isinstance(entry.shape[-1], int) else SIDE
         picture = resize(color, (side, side), order=1, anti_aliasing=True)
         picture = (picture / max(float(picture.max()), 1e-6) - MEAN) / DEVIATION
-        found = np.asarray(
+        output = np.asarray(
             session.run(None, {entry.name: np.moveaxis(picture, -1, 0)[None].astype(np.float32)})[0][0, 0]
         )
     except Exception as failure:  # onnxruntime's own errors have no common class
@@ -44,7 +46,7 @@ def saliency(color: np.ndarray, network: str | Path) -> np.ndarray:
             f"is no network of U²-Net's structure: {str(failure).strip().splitlines()[0]}",
             "take u2net.onnx, u2netp.onnx or silueta.onnx",
         ) from None
-    low, high = float(found.min()), float(found.max())
+    low, high = float(output.min()), float(output.max())
     if not (np.isfinite(low) and np.isfinite(high) and high > low):
         raise InputError(network, "finds nothing in the picture", "give a mask with --mask")
-    return np.clip(resize((found - low) / (high - low), color.shape[:2], order=1), 0, 1).astype(np.float32)
+    return np.clip(resize((output - low) / (high - low), color.shape[:2], order=1), 0, 1).astype(np.float32)

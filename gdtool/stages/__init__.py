@@ -1,1 +1,1 @@
-"""The stages: each turns folders into arrays, calls the rooms, and writes a folder."""
+"""Declare the stages: each turns folders into arrays, calls the rooms, and writes a folder."""

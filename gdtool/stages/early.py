@@ -1,4 +1,4 @@
-"""Check before the work what a stage would need only later: devices, packages, and the files that options name."""
+"""Check before the run what a stage would need only later: devices, packages, and the files that options name."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def require_file(option: str, value: str) -> None:
 
 
 def require_model(option: str, value: str) -> None:
-    """Raise InputError unless an option names a model file by its ending, or a generated object (procedural:SEED)."""
+    """Raise InputError unless an option names procedural:SEED or a file with the suffix of a model."""
     if value.startswith("procedural:"):
         return
     from gdtool.assets.load import SUFFIXES
@@ -67,8 +67,10 @@ def require_model(option: str, value: str) -> None:
 
 
 def require_picture(option: str, value: str) -> tuple[int, int]:
-    """Width and height of the picture that an option names, from its header. Raises what reading it would where it has
-    none."""
+    """Return width and height of the picture that an option names, from its header.
+
+    Raises the errors of reading it where the header cannot be read.
+    """
     require_file(option, value)
     header = _header(value)
     if header is None:
@@ -80,8 +82,10 @@ def require_picture(option: str, value: str) -> tuple[int, int]:
 
 
 def require_environment(option: str, value: str, names: tuple[str, ...]) -> None:
-    """Raise InputError unless an option names a light: one of names, random:NUMBER, or a lat-long picture of float
-    pixels."""
+    """Raise InputError unless an option names a light.
+
+    A light is one of names, random:NUMBER, or a lat-long picture with float pixels.
+    """
     if value in names:
         return
     cure = f"use {', '.join(names)}, random:NUMBER, or an .hdr or .exr file with {option}"
@@ -102,7 +106,7 @@ def require_environment(option: str, value: str, names: tuple[str, ...]) -> None
 
 
 def require_fov(degrees: float) -> None:
-    """Raise UsageError for a field of view that is neither orthographic (0) nor wide enough to compute with."""
+    """Raise UsageError for a perspective field of view too narrow to compute with; 0 is orthographic."""
     if 0 < degrees < LEAST_FOV:
         raise UsageError(
             f"--fov {degrees:g}", f"is narrower than {LEAST_FOV:g} degrees", "use --fov 0, which is orthographic"
@@ -110,7 +114,7 @@ def require_fov(degrees: float) -> None:
 
 
 def _header(path: str) -> tuple[int, int, bool] | None:
-    """Width, height and whether the pixels are floats, of an image file; None where its header cannot be read."""
+    """Read width and height of an image file, and whether its pixels are floats; None without a readable header."""
     import OpenImageIO as oiio
 
     try:

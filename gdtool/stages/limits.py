@@ -1,4 +1,4 @@
-"""Hold a stage to the time that --seconds or --budget gives it."""
+"""Limit a stage to the time that --seconds or --budget gives it."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from contextlib import contextmanager
 from gdtool.core.ending import GRACE, time_limit
 from gdtool.core.errors import ResourceError
 
-# A run ends within OVER x its time limit + MORE seconds: what it is asked for takes its time, reading, checking and
+# A run has to end within OVER x its time limit + MORE seconds. The limit is for the main work; reading, checking and
 # writing come on top.
 OVER, MORE = 2.0, 5.0
 _UNWIND = GRACE + 0.3  # seconds of MORE that are left for the end
-# A quick machine takes half the time of the one that the rates were measured on: what takes longer even so is refused
-# at once.
+# Share of the measured time that a quick machine takes. Work that would be too long even there is refused at once.
 _QUICK = 0.5
 
 
 @contextmanager
 def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]:
-    """Raise ResourceError in a block that takes longer than OVER x seconds + MORE."""
+    """Raise ResourceError in a block that takes longer than OVER x seconds + MORE.
+
+    option: the option that gives the seconds. name: of the object. cure: what to do about it.
+    """
     most = OVER * seconds + MORE - _UNWIND
     with time_limit(
         most, ResourceError(name, f"is not done after {most:g} s, and {option} {seconds:g} allows no more", cure)
@@ -29,9 +31,9 @@ def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]
 
 
 def require_time(needed: float, seconds: float, option: str, name: str, cure: str) -> None:
-    """Raise ResourceError, before the work, where even the quickest way takes longer than held_to() lets it.
+    """Raise ResourceError, before the work, where even the quickest method takes longer than held_to() permits.
 
-    needed: seconds of the quickest way on the machine that it was measured on.
+    needed: seconds of the quickest method on the machine that it was measured on.
     """
     if _QUICK * needed > OVER * seconds + MORE - _UNWIND:
         raise ResourceError(

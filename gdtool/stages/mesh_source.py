@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeGuard
+
 from gdtool.core.errors import InputError
+from gdtool.core.folder import Folder
+from gdtool.core.sources import Source
 from gdtool.core.stage import Inputs, Output
 
-# The longest side of a mesh that floating-point numbers can still square and cube.
+if TYPE_CHECKING:
+    from gdtool.assets.scene import Scene
+
+# Bounds of a mesh's longest side, in its own units: its square and cube are still finite float64 numbers, not 0.
 _MIN_EXTENT, _MAX_EXTENT = 1e-150, 1e150
 
 
-def source_path(inputs: Inputs):
-    """Return what error messages name: the path of a folder, else the source itself."""
-    return getattr(inputs.main, "path", inputs.main)
+def source_path(inputs: Inputs) -> Path | str:
+    """Return the path that messages name the source by."""
+    return inputs.main.path if isinstance(inputs.main, Folder) else inputs.main
 
 
 def read_triangles(inputs: Inputs, out: Output):
     """Read a surface folder or a mesh file as triangles in the unit box.
 
-    Returns vertices (v, 3), triangles (t, 3), the (4, 4) matrix back to the source's frame, and quads (q, 4) where the
-    source has nothing else, or None.
+    Returns vertices (v, 3), triangles (t, 3), source_from_world (4, 4), and quads (q, 4) of a source that is all quads,
+    else None.
     """
     import numpy as np
 
@@ -28,7 +36,7 @@ def read_triangles(inputs: Inputs, out: Output):
     from gdtool.geometry.topology import compact
 
     main, quads = inputs.main, None
-    if hasattr(main, "content"):
+    if isinstance(main, Folder):
         from gdtool.folders.surface import read_surface
 
         surface = read_surface(main)
@@ -57,8 +65,8 @@ def read_triangles(inputs: Inputs, out: Output):
 def read_quad_mesh(inputs: Inputs, out: Output):
     """Read a mesh folder or a mesh file, with its texture coordinates where it has some.
 
-    Returns the QuadMesh in the unit box, faces without area or with a repeated corner left out, and the (4, 4) matrix
-    back to the source's frame.
+    Returns the QuadMesh in the unit box, without faces that have no area or a repeated corner, and source_from_world
+    (4, 4).
     """
     import numpy as np
 
@@ -67,7 +75,7 @@ def read_quad_mesh(inputs: Inputs, out: Output):
     from gdtool.geometry.meshes import QuadMesh
 
     main = inputs.main
-    if hasattr(main, "content"):
+    if isinstance(main, Folder):
         mesh, matrix = read_mesh(main), np.array(main.content.source_from_world).reshape(4, 4)
     else:
         mesh, matrix = read_obj(main) if _is_obj(main) else _scene_as_mesh(inputs, out), None
@@ -85,14 +93,16 @@ def read_quad_mesh(inputs: Inputs, out: Output):
     return _without_degenerate(mesh, inputs, out), matrix
 
 
-def _is_obj(main) -> bool:
-    return not isinstance(main, str) and main.suffix.lower() == ".obj"
+def _is_obj(source: Source) -> TypeGuard[Path]:
+    """Tell whether a source is an OBJ file, whose quads are kept."""
+    return isinstance(source, Path) and source.suffix.lower() == ".obj"
 
 
-def _load_scene(inputs: Inputs, out: Output):
-    """Load any mesh file, and warn of what its reader had to say."""
+def _load_scene(inputs: Inputs, out: Output) -> Scene:
+    """Load any mesh file or generated object, with the warnings of its reader."""
     from gdtool.assets.load import load_scene
 
+    assert not isinstance(inputs.main, Folder)
     scene = load_scene(inputs.main)
     for text in scene.notes:
         out.warn(f"{inputs.name}: {text}")
@@ -108,7 +118,7 @@ def _require_extent(extent: float, inputs: Inputs) -> None:
 
 
 def _scene_as_mesh(inputs: Inputs, out: Output):
-    """Read the triangles of any mesh file, and merge the vertices that only texture coordinates tell apart."""
+    """Read the triangles of any mesh file, and merge the vertices that differ in their texture coordinates only."""
     import numpy as np
 
     from gdtool.geometry.meshes import QuadMesh
@@ -127,7 +137,7 @@ def _scene_as_mesh(inputs: Inputs, out: Output):
 
 
 def _without_degenerate(mesh, inputs: Inputs, out: Output):
-    """Leave out faces without area or with a repeated corner, and warn of them."""
+    """Remove faces that have no area or a repeated corner, and warn about them."""
     import numpy as np
 
     from gdtool.geometry.mesh_quality import polygon_normals

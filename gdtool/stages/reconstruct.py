@@ -1,8 +1,8 @@
-"""Views to a watertight surface with albedo, roughness and metallic at every vertex.
+"""Reconstruct a watertight surface from views, with albedo, roughness and metallic at every vertex.
 
-Use it after sample-views or render-dataset, or on a views folder of your own. Any subset of the domains will do: depth
-and normals shape the surface where there are any, silhouettes bound it, material views color it. The grid method
-(default) carves and refines a signed distance grid in seconds; the paper method fits the SDF and material networks.
+Use it after sample-views or render-dataset, or on a views folder of your own. Any subset of the domains is accepted:
+depth and normals shape the surface, silhouettes bound it, material views color it. The grid method (default) carves and
+refines a signed distance grid in seconds; the paper method fits networks of distance and material.
 
 Example:
   gdtool reconstruct cat.asset/views
@@ -11,88 +11,93 @@ Example:
 from __future__ import annotations
 
 import contextlib
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
 from gdtool.core.errors import UsageError
-from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import MOST_SECONDS, MOST_SEED, Inputs, Output, Stage
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import DOMAINS, ViewsContent
+from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
+from gdtool.stages.shared_options import Seed
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gdtool.fields import pipeline
+    from gdtool.fields.appearance.appearance import Appearance
+    from gdtool.fields.neural.paper import PaperOptions
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of reconstruct."""
 
     method: Annotated[
-        Literal["grid", "paper"], Meta(description="grid: carve and refine; paper: SDF and material networks")
+        Literal["grid", "paper"],
+        Meta(description="grid: carve and refine a distance grid. paper: fit networks of distance and material."),
     ] = "grid"
     resolution: Annotated[
         int,
-        Meta(ge=0, le=512, description="grid samples along a unit of length; 0: a little finer than the views' pixels"),
+        Meta(
+            ge=0, le=512, description="Grid samples along a unit of length; 0: a little finer than the views' pixels."
+        ),
     ] = 0
-    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: the most optimisation steps of each phase")] = 1000
+    steps: Annotated[int, Meta(ge=1, le=100_000, description="paper: most optimisation steps of each phase.")] = 1000
     precision: Annotated[
         Literal["float32", "bfloat16"],
-        Meta(description="paper: of the networks' layers while the first shape is fitted; the end is always float32"),
+        Meta(description="paper: arithmetic while the first shape is fitted; the rest is always float32."),
     ] = "float32"
     root: Annotated[
-        Literal["secant", "median"], Meta(description="paper: surface point between two samples of a ray")
+        Literal["secant", "median"],
+        Meta(description="paper: how the surface point between two samples of a ray is found."),
     ] = "secant"
-    brdf: Annotated[Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with")] = (
-        "gltf"
-    )
+    brdf: Annotated[
+        Literal["gltf", "paper"], Meta(description="paper: reflection model that color is fitted with.")
+    ] = "gltf"
     budget: Annotated[
         float,
         Meta(
             ge=0,
             le=MOST_SECONDS,
-            description="seconds to be done in: grid takes a coarser grid, paper shortens its schedule; "
-            "0: as long as it helps",
+            description="Seconds that the run may take: grid then uses a coarser grid, paper fewer steps. 0: as long "
+            "as it helps.",
         ),
     ] = 0.0
-    ignore: Annotated[tuple[str, ...], Meta(description="domains to leave out, for example depth,normal")] = ()
-    seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="seed of everything random")] = 0
+    ignore: Annotated[tuple[str, ...], Meta(description="Domains to leave out, for example depth,normal.")] = ()
+    seed: Seed = 0
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise UsageError for domains that there are not."""
+    """Raise UsageError for an unknown domain."""
     unknown = sorted(set(options.ignore) - set(DOMAINS))
     if unknown:
         raise UsageError("--ignore", f"{unknown[0]!r} is no domain", f"choose from {', '.join(DOMAINS)}")
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder. Raises ResourceError where it takes longer than --budget by far
-    (stages/limits.py)."""
+    """Reconstruct one views folder. Raises ResourceError where it takes much longer than --budget (limits.held_to)."""
     from gdtool.stages.limits import held_to
 
     cure = f"raise --budget to {max(round(2 * options.budget), 1)}, or leave it out"
     with held_to(options.budget, "--budget", inputs.name, cure) if options.budget else contextlib.nullcontext():
-        _run(inputs, options, out)
+        _reconstruct(inputs.folder, options, out)
 
 
-def _run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder, however long it takes."""
+def _reconstruct(folder: Folder, options: Options, out: Output) -> None:
+    """Read the views, make the surface with its materials, and write both."""
     from gdtool.fields import pipeline
-    from gdtool.fields.appearance.appearance import AppearanceOptions, appearance
-    from gdtool.fields.grid.fusion import is_closed_manifold
-    from gdtool.fields.neural.paper import PaperOptions
-    from gdtool.folders.surface import Surface, write_surface
     from gdtool.folders.views import read_views
-    from gdtool.geometry.meshes import TriMesh
-    from gdtool.geometry.normals import vertex_normals
 
-    folder = inputs.main
-    # The paper's method keeps its time by itself.
+    # The paper's method divides the budget among its steps itself.
     clock = pipeline.time_limit(options.budget if options.method == "grid" else 0.0)
     with out.step("read"):
         read = read_views(folder, tuple(d for d in DOMAINS if d not in options.ignore))
     for domain in DOMAINS:
         if domain not in read.images:
             out.skip(domain, "left out by --ignore" if domain in options.ignore else "the views do not hold it")
-    picture = folder.content.picture
-    views = pipeline.ViewImages(read.cameras, read.names, read.mask, read.images, folder.path, bool(picture))
+    picture = folder.content_as(ViewsContent).picture
+    views = pipeline.ViewImages(read.cameras, list(read.names), read.mask, read.images, folder.path, bool(picture))
     pipeline.check_masks(views, out)
     with out.step("align"):
         aligned = pipeline.align(views, options.resolution, clock, out)
@@ -101,33 +106,48 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     pipeline.check_cameras(folder.file("cameras.json"), views.cameras, shape.vertices)
     mesh = pipeline.Surface(shape.vertices, shape.faces)
     if options.method == "paper":
-        settings = PaperOptions(
-            options.steps,
-            0,
-            options.steps,
-            rule=options.root,
-            brdf=options.brdf,
-            seed=options.seed,
-            budget=options.budget,
-            device=out.device,
-            precision=options.precision,
-        )
-        mesh = pipeline.fit_paper(views, aligned, shape, settings, out)
-    with out.step("materials"):
-        triangles = TriMesh(mesh.vertices, mesh.faces)
-        normals = vertex_normals(triangles)
-        look = appearance(
-            views.cameras,
-            views.mask,
-            views.images,
-            triangles,
-            normals,
-            AppearanceOptions(shape.step, read.light, options.seed),
-        )
-        for what, reason in look.skipped:
-            out.skip(what, reason)
-    if mesh.fit is not None:
-        pipeline.use_fit(mesh, views, look, out)
+        mesh = pipeline.fit_paper(views, aligned, shape, _paper_options(options, out), out)
+    normals, look = pipeline.find_materials(views, mesh, shape.step, read.light, options.seed, out)
+    figures = {
+        **pipeline.figures_of(aligned, shape, grow),
+        "mean_confidence": float(look.confidence.mean()),
+        **look.figures,
+        **mesh.figures,
+    }
+    with out.step("write"):
+        _write(folder, mesh, normals, look, options.method, figures, out)
+
+
+def _paper_options(options: Options, out: Output) -> PaperOptions:
+    """Return the settings of the paper's networks."""
+    from gdtool.fields.neural.paper import PaperOptions
+
+    return PaperOptions(
+        options.steps,
+        0,
+        options.steps,
+        rule=options.root,
+        brdf=options.brdf,
+        seed=options.seed,
+        budget=options.budget,
+        device=out.device,
+        precision=options.precision,
+    )
+
+
+def _write(
+    folder: Folder,
+    mesh: pipeline.Surface,
+    normals: np.ndarray,
+    look: Appearance,
+    method: str,
+    figures: dict[str, float | str],
+    out: Output,
+) -> None:
+    """Write the surface of the views in folder."""
+    from gdtool.fields.grid.fusion import is_closed_manifold
+    from gdtool.folders.surface import Surface, write_surface
+
     surface = Surface(
         mesh.vertices,
         mesh.faces,
@@ -140,22 +160,15 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
         look.views,
         look.residual,
     )
-    report = {
-        **pipeline.figures_of(aligned, shape, grow),
-        "mean_confidence": float(look.confidence.mean()),
-        **look.figures,
-        **mesh.figures,
-    }
-    with out.step("write"):
-        write_surface(
-            out,
-            surface,
-            watertight=is_closed_manifold(mesh.faces),
-            method=options.method,
-            field=mesh.fit is not None,
-            source_from_world=folder.content.source_from_world,
-            report=report,
-        )
+    write_surface(
+        out,
+        surface,
+        watertight=is_closed_manifold(mesh.faces),
+        method=method,
+        field=mesh.fit is not None,
+        source_from_world=folder.content.source_from_world,
+        report=figures,
+    )
 
 
 STAGE = Stage(

@@ -1,9 +1,8 @@
-"""Surface to clean quads: about as many as asked, along creases and flat parts, watertight where the surface is.
+"""Turn a surface into clean quads along creases and flat parts, watertight where the surface is.
 
 Use it after reconstruct, or on any mesh file (.obj, .ply, .stl, .glb) whose triangles you want to edit, subdivide or
-animate. Bevels that marching cubes left are restored to the creases they cut off. A mesh that already meets the
-request is passed through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface allows
-it.
+animate. Bevels that marching cubes left are restored to sharp creases. A mesh that already meets the request is passed
+through. --triangles N decimates instead; --symmetry auto mirrors one half where the surface is symmetric.
 
 Example:
   gdtool remesh cat.asset/surface --faces 20000
@@ -11,7 +10,7 @@ Example:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -21,17 +20,20 @@ from gdtool.core.errors import UsageError
 from gdtool.core.kinds import MeshContent
 from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
+if TYPE_CHECKING:
+    from gdtool.geometry.meshes import TriMesh
+
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of remesh."""
 
-    faces: Annotated[int, Meta(ge=16, le=2_000_000, description="quads to make, met within 3 %")] = 20000
+    faces: Annotated[int, Meta(ge=16, le=2_000_000, description="Number of quads, met within 3 %.")] = 20000
     quad_size: Annotated[
         float,
         Meta(
             ge=0,
             le=1,
-            description="mean side of the quads, as a share of the longest side, instead of --faces; 0: --faces",
+            description="Mean edge length of the quads as a share of the longest side, instead of --faces; 0: --faces.",
         ),
     ] = 0.0
     max_deviation: Annotated[
@@ -39,41 +41,41 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Meta(
             ge=0,
             le=1,
-            description="the fewest quads, up to --faces, that stay within this share of the longest "
-            "side of the surface; 0: --faces",
+            description="Make the fewest quads, up to --faces, that stay within this distance of the surface, a share "
+            "of its longest side; 0: --faces.",
         ),
     ] = 0.0
     triangles: Annotated[
-        int, Meta(ge=0, le=10_000_000, description="decimate to this many triangles instead of making quads; 0: quads")
+        int, Meta(ge=0, le=10_000_000, description="Decimate to so many triangles instead of making quads; 0: quads.")
     ] = 0
     crease_angle: Annotated[
-        float, Meta(ge=0, le=180, description="edges that turn by more degrees are kept sharp; 0: none")
+        float, Meta(ge=0, le=180, description="Keep edges sharp whose faces turn by more degrees than this; 0: none.")
     ] = 30.0
-    restore_creases: Annotated[bool, Meta(description="draw out the bevels of marching cubes to sharp creases")] = True
+    restore_creases: Annotated[bool, Meta(description="Sharpen bevels that marching cubes leave at creases.")] = True
     symmetry: Annotated[
         Literal["none", "auto", "x", "y", "z"],
         Meta(
-            description="make one half and mirror it where the surface is its own mirror image across the middle of "
-            "this axis; auto: of the best of the three"
+            description="Remesh one half and mirror it, where the surface mirrors itself across the middle of this "
+            "axis. auto: the axis that fits best."
         ),
     ] = "none"
     engine: Annotated[
         Literal["auto", "instant-meshes", "quadriflow", "split"],
-        Meta(description="auto is instant-meshes with fallbacks; quadriflow needs pyQuadriFlow; split needs no engine"),
+        Meta(description="auto: instant-meshes with fallbacks. quadriflow needs gdtool[quadriflow], split nothing."),
     ] = "auto"
     smooth_iterations: Annotated[
-        int, Meta(ge=0, le=100, description="rounds of evening out the quads on the surface")
+        int, Meta(ge=0, le=100, description="Rounds of smoothing the quads on the surface.")
     ] = 5
     seconds: Annotated[
         float,
         Meta(
             gt=0,
             le=MOST_SECONDS,
-            description="time limit; engines are tried in the first 70 % of it, what is not done by then is paired "
-            "triangles; after twice the limit and 5 s the run fails",
+            description="Time limit. Engines are tried in the first 70 % of it; parts that are not done by then are "
+            "made of paired triangles. After twice the limit and 5 s the run fails.",
         ),
     ] = 120.0
-    keep: Annotated[bool, Meta(description="pass a mesh through that already meets the request")] = True
+    keep: Annotated[bool, Meta(description="Pass a mesh through that already meets the request.")] = True
 
 
 def check(inputs: Inputs, options: Options) -> None:
@@ -96,10 +98,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     enough = max(round(SECONDS_PER_QUAD * options.faces), round(2 * options.seconds), 1)
     with held_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
-        _run(inputs, options, out)
+        _remesh(inputs, options, out)
 
 
-def _run(inputs: Inputs, options: Options, out: Output) -> None:
+def _remesh(inputs: Inputs, options: Options, out: Output) -> None:
+    """Remesh one surface or mesh file and write the mesh."""
     from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 
     prepare(collapse_in_child, CHILD_MODULES)  # for the first child of remesh(), while the mesh is read
@@ -131,8 +134,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
             out.seconds[name] = out.seconds.get(name, 0.0) + seconds
     with out.step("measure"):
         figures = report_figures(made, mesh)
-    if text := count_warning(made, mesh.faces, _goal(options)):
-        out.warn(f"{inputs.name}: {text}")
+    if warning := count_warning(made, mesh.faces, _goal(options)):
+        out.warn(f"{inputs.name}: {warning}")
     with out.step("write"):
         write_mesh(out, QuadMesh(made.mesh.vertices, made.mesh.faces.astype(np.int32)))
     is_quad = made.mesh.is_quad
@@ -148,8 +151,8 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
     )
 
 
-def _with_count(mesh, options: Options, out: Output) -> Options:
-    """Return options with --quad-size turned into a number of faces."""
+def _with_count(mesh: TriMesh, options: Options, out: Output) -> Options:
+    """Return options with --quad-size converted to a number of faces."""
     from gdtool.remesh.face_budget import quads_of_size
     from gdtool.remesh.limits import MAX_QUADS, MIN_QUADS
 
@@ -162,8 +165,8 @@ def _with_count(mesh, options: Options, out: Output) -> Options:
     return msgspec.structs.replace(options, faces=possible)
 
 
-def _clean(mesh, inputs: Inputs, options: Options, out: Output):
-    """Return the repaired TriMesh; warn of what was repaired, of open surfaces and of enclosed bodies."""
+def _clean(mesh: TriMesh, inputs: Inputs, options: Options, out: Output) -> TriMesh:
+    """Repair a mesh; warn of each repair, of open surfaces and of enclosed bodies."""
     from gdtool.geometry import repair
     from gdtool.geometry.enclosed_bodies import enclosed_bodies_warning
     from gdtool.remesh.limits import SECONDS_PER_QUAD
@@ -183,7 +186,7 @@ def _clean(mesh, inputs: Inputs, options: Options, out: Output):
 
 
 def _goal(options: Options):
-    """Return the room's Goal from the options."""
+    """Make the room's Goal of the options."""
     from gdtool.remesh.methods import Goal
     from gdtool.remesh.task import Request
 

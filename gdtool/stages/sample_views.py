@@ -1,13 +1,14 @@
 """Make six views of an object, in six domains, from one picture of it.
 
-Takes an image with alpha, or one that is then cut out of its background, for sure where that is plain and as a guess
-where it is busy, or any image with --mask or --matting. The subject is cropped and centred as in training. Writes
-color, normal, depth, albedo, roughness, metallic and masks of the default rig for reconstruct, at the model's own
-resolution, and the picture as it was framed at its own, for bake. What the picture shows and the outlines of the other
-views leave no room for is drawn into them. The albedo of its own view gets the picture's contrast, as far as that is
-paint and not light. What the model takes for rather metal than not is metal. It warns of pictures unlike the model's
-training, and where the result shows that the model is unsure of it. Use --no-crop when the picture is framed like the
-rig's front view already (an orthographic render of a normalised object).
+The picture needs an alpha channel, --mask or --matting; without them the subject is cut out of a plain background, and
+guessed where the background is busy. The subject is cropped and centred as in training; use --no-crop for an
+orthographic render of a normalised object, framed like the rig's front view.
+
+Writes color, normal, depth, albedo, roughness, metallic and masks of the default rig for reconstruct, at the model's
+resolution, and the framed picture at its own resolution for bake. Three steps follow the sampling. Parts of the picture
+for which the outlines of the other views leave no room are added to those views. The front albedo takes over the
+picture's contrast where that is paint and not light. Metallic values are pushed to 0 or 1. A warning tells of
+a picture unlike those of the training, and of views that the model is unsure of.
 
 Example:
   gdtool sample-views cat.png --seed 7
@@ -15,21 +16,28 @@ Example:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.errors import UsageError
 from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gdtool.folders.views import Views
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of sample-views."""
 
     steps: (
-        Annotated[int, Meta(ge=1, le=1000, description="Denoising steps; without it what measured best for the model.")]
+        Annotated[
+            int,
+            Meta(ge=1, le=1000, description="Denoising steps; without it the number that measured best for the model."),
+        ]
         | None
     ) = None
     guidance: Annotated[
@@ -40,40 +48,46 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     ] = 0.0
     guided_to: Annotated[
         float,
-        Meta(ge=0, le=1, description="Most noise that guidance acts at; outside there is none, and half the time."),
+        Meta(ge=0, le=1, description="Most noise that guidance acts at. Steps outside of the two take half the time."),
     ] = 1.0
     scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
     mirror: Annotated[
         bool,
         Meta(
-            description="Take the mean with what the picture's mirror image gives, where the model is one that gains "
-            "from it; twice the time."
+            description="Average with the views of the picture's mirror image, where the model's card says that it "
+            "gains from that; twice the time."
         ),
     ] = True
     seed: Annotated[
         int, Meta(ge=0, le=MOST_SEED, description="Seed of the noise, the same for every object whatever the order.")
     ] = 0
     domains: Annotated[
-        tuple[str, ...], Meta(description="Domains to write; color is made in any case, being the primary.")
+        tuple[str, ...], Meta(description="Domains to write; color is always sampled, since the others depend on it.")
     ] = DOMAINS
-    mask: file_option("Image that is bright where the subject is.") = None
-    matting: file_option(
-        "ONNX file of a network that cuts the subject out of any background: u2net.onnx, u2netp.onnx or silueta.onnx "
-        "(needs gdtool[matting])."
-    ) = None
+    mask: Annotated[
+        str | None, Meta(description="Picture of the same size that is bright where the subject is.", extra=FILE)
+    ] = None
+    matting: Annotated[
+        str | None,
+        Meta(
+            description="ONNX file of a network that cuts the subject out of any background: u2net.onnx, u2netp.onnx "
+            "or silueta.onnx (needs gdtool[matting]).",
+            extra=FILE,
+        ),
+    ] = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
     precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
     compile: Annotated[
         bool,
         Meta(
-            description="Compile the network first (torch.compile, needs a C++ compiler): two minutes the first time, "
-            "ten seconds afterwards, then a third less time a step."
+            description="Compile the network first (torch.compile, needs a C++ compiler). It takes two minutes the "
+            "first time and ten seconds afterwards, and saves a third of each step."
         ),
     ] = False
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --mask and --matting would stop the run with."""
+    """Refuse, before the run, a bad --mask and a --matting without its package."""
     from gdtool.stages import early
 
     if options.mask is not None:
@@ -98,22 +112,22 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.checkpoint import wonder3d
     from gdtool.diffusion.checkpoint.weights import load_model
     from gdtool.diffusion.data.condition import PictureOptions, condition_of, extent_of
-    from gdtool.diffusion.inference.pipeline import sample_condition, tell_doubts
+    from gdtool.diffusion.inference.pipeline import choose_domains, sample_condition, tell_doubts
     from gdtool.diffusion.inference.result import views_from_images
     from gdtool.diffusion.inference.sampling import SamplingOptions
     from gdtool.diffusion.network.encoding import BACKGROUND
 
     torch.set_num_threads(out.threads)
     with out.step("load"):
-        chosen = inputs.second["model"]
-        folder = getattr(chosen, "path", chosen)
+        folder = inputs.second_path("model")
+        assert folder is not None  # the bundled model is the default
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
-    domains = _domains(options, config)
+    domains = choose_domains(None if options.domains == DOMAINS else options.domains, config)
     with out.step("condition"):
         extent = extent_of(config.convention)
         framing = PictureOptions(options.mask, options.matting, options.crop, extent, config.image_size)
-        condition, picture = condition_of(inputs.main, inputs.name, framing, out.warn)
+        condition, picture = condition_of(inputs.path, inputs.name, framing, out.warn)
     with out.step("sample"):
         settings = SamplingOptions(
             domains=domains,
@@ -143,40 +157,26 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         _write(views, report, condition, picture, domains, out)
 
 
-def _domains(options: Options, config) -> tuple[str, ...]:
-    """Return the domains to write; without --domains all that the model has. Raises UsageError for others."""
-    domains = config.domains if options.domains == DOMAINS else options.domains
-    unknown = [d for d in domains if d not in config.domains]
-    if unknown or not domains:
-        raise UsageError(
-            "--domains",
-            f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
-            f"choose from {','.join(config.domains)}",
-        )
-    return domains
-
-
-def _write(views, report, condition, picture, domains, out: Output) -> None:
-    """Write the views folder, the condition as the model was shown it, and the framed picture."""
+def _write(
+    views: Views,
+    report: dict[str, float],
+    condition: np.ndarray,
+    picture: np.ndarray,
+    domains: tuple[str, ...],
+    out: Output,
+) -> None:
+    """Write the views folder, the condition image that the model saw, and the framed picture."""
     from gdtool.diffusion.data.condition import encoded_rgba
+    from gdtool.diffusion.inference.pipeline import tell_unused_picture
     from gdtool.folders.views import write_views
     from gdtool.images.io import write_png
 
     write_png(out.path("condition/000.png"), encoded_rgba(condition))
-    shown = "front" if "front" in views.names else ""  # the view that is the picture's own
-    if not report["drawn_share"]:
-        out.skip(
-            "parts of the picture in the other views",
-            "each has room for all of them" if shown else "no view is the picture's own",
-        )
-    if not report["painted_share"] and "albedo" in domains:
-        out.skip(
-            "paint of the picture",
-            "its detail is light, or metal, by the model's albedo" if shown else "no view is the picture's own",
-        )
-    if shown:
+    own_view = "front" if "front" in views.names else ""  # the view that the picture was taken from
+    tell_unused_picture(report, domains, bool(own_view), out)
+    if own_view:
         write_png(out.path("picture.png"), encoded_rgba(picture))
-    write_views(out, views, conditions=1, picture=shown, report=report)
+    write_views(out, views, conditions=1, picture=own_view, report=report)
 
 
 STAGE = Stage(

@@ -1,11 +1,13 @@
 """Train the multi-view PBR diffusion model on rendered objects.
 
-Takes a dataset folder (or any views folders with all six domains) of render-dataset and writes a model folder for
-sample-views: weights, configuration, card, loss curve and validation images. Use it to train the small configuration on
-a processor, to go on from a model you have (--start; with --size, at a larger size), or, with --preset paper, to grow
-Stable Diffusion to six domains. Killed at any time, the same line goes on where it was. Sources may be .tar files of
-views folders, plain or in WebDataset's naming. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes
-(GDTOOL_SHARD=1 splits the weights as well). --plan tells what a configuration costs, without data.
+It takes a dataset folder of render-dataset, or any views folders with all six domains, also in .tar files, plain or in
+WebDataset's naming. It writes a model folder for sample-views: weights, configuration, card, loss curve and validation
+images.
+
+Use it to train the small configuration on a processor, to go on from a model you have (--start; with --size, at a
+larger size), or, with --preset paper, to extend Stable Diffusion to six domains. Killed at any time, the same command
+goes on where it was. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits
+the weights as well). --plan predicts the cost of a configuration, without data.
 
 Example:
   gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
@@ -19,11 +21,11 @@ import msgspec
 from msgspec import Meta
 
 from gdtool.core.errors import UsageError
-from gdtool.core.stage import MOST_SEED, Inputs, Output, SecondInput, Stage, file_option
+from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
 
 MOST_STEPS = 10**9
 MOST_MINUTES = 525_600.0  # a year
-HELD_OUT = 4  # objects, or all but one where there are no more
+HELD_OUT = 4  # objects; all but one where there are fewer
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -34,15 +36,18 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
         Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains."),
     ] = "none"
-    config: file_option('JSON file of changes to it: {"model": {...}, "train": {...}}.') = None
+    config: Annotated[
+        str | None,
+        Meta(description='JSON file of changes to the preset: {"model": {...}, "train": {...}}.', extra=FILE),
+    ] = None
     size: (
         Annotated[
             int,
             Meta(
                 ge=16,
                 le=1024,
-                description="Width and height of a view in pixels, patches in proportion, so at the same cost; "
-                "a smaller model of --start is grown to it.",
+                description="Width and height of a view, pixels. Patches grow in proportion, so that a step costs the "
+                "same. A smaller model of --start is grown to it.",
             ),
         ]
         | None
@@ -56,7 +61,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
             Meta(
                 gt=0,
                 le=MOST_MINUTES,
-                description="Stop after so many minutes of training; the learning rate falls accordingly.",
+                description="Stop after so many minutes of training; the learning rate has fallen by then.",
             ),
         ]
         | None
@@ -68,7 +73,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         Meta(
             ge=0,
             le=1_000_000,
-            description="Last objects of the data that are not trained on but shown in validation images.",
+            description="Number of objects, the last of the data, that validation images show and training leaves out.",
         ),
     ] = HELD_OUT
     checkpoint_every: Annotated[int, Meta(ge=1, le=MOST_STEPS, description="Steps between checkpoints.")] = 100
@@ -76,14 +81,14 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     tensorboard: Annotated[
         bool,
         Meta(
-            description="Write TensorBoard's event files as well, into the run's workspace and the model "
-            "(needs tensorboard)."
+            description="Also write TensorBoard's event files, into the run's workspace and the model (needs "
+            "gdtool[tensorboard])."
         ),
     ] = False
 
 
 def check(inputs: Inputs, options: Options) -> None:
-    """Raise what --config, --tensorboard and --held-out would stop the run with."""
+    """Refuse, before the run, a bad --config, --tensorboard without its package, and too many --held-out."""
     from gdtool.stages import early
 
     configured(options)
@@ -93,8 +98,8 @@ def check(inputs: Inputs, options: Options) -> None:
         )
     from gdtool.diffusion.data.sources import count_views_folders
 
-    count = count_views_folders(inputs.all)
-    # Of fewer objects than the default holds out, one is left to train on: that is no mistake of the user's.
+    count = count_views_folders(inputs.on_disk)
+    # With fewer objects than the default holds out, one is left to train on: the user did not ask for that number.
     if options.held_out >= count and options.held_out != HELD_OUT:
         raise UsageError(
             f"--held-out {options.held_out}",
@@ -116,9 +121,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     torch.set_num_threads(out.threads)
     model_config, train_config = configured(options)
-    start = inputs.second["start"]
     with out.step("decode"):
-        folders, count = views_folders(inputs.all, out.workspace), count_views_folders(inputs.all)
+        folders, count = views_folders(inputs.on_disk, out.workspace), count_views_folders(inputs.on_disk)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     used = len(objects) - min(options.held_out, len(objects) - 1)
     shown, objects = objects.part(slice(used, None)), objects.part(slice(used))
@@ -128,7 +132,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device
     )
     workspace = out.workspace.absolute()
-    order = Order(model_config, train_config, start and start.path, workspace, used, run_options)
+    order = Order(model_config, train_config, inputs.second_path("start"), workspace, used, run_options)
     distributed.send(order)
     with out.step("train"):
         state = execute(order, objects, recorder.observers(out))
@@ -145,7 +149,7 @@ def follow(threads: int) -> None:
 
 
 def dismiss() -> None:
-    """End the first of several processes, its work done, and let the others go."""
+    """Let the other processes end, as the first one's last step."""
     from gdtool.diffusion.training import distributed
 
     distributed.leave()
@@ -160,7 +164,7 @@ def plan(options: Options, as_json: bool) -> str:
 
 
 def configured(options: Options):
-    """Return the preset with the changes of the ablation, of --config and of the flags. Raises InputError."""
+    """Apply the ablation, --config and the flags to the preset. Raises InputError."""
     from gdtool.diffusion.configure import configuration
 
     # Without --steps the minutes decide when the training ends.

@@ -1,8 +1,8 @@
-"""Mesh to atlas: few charts, cut along quad edges and creases, flattened without mirroring and packed for mip-mapping.
+"""Unwrap a mesh: few charts, cut along quad edges and creases, flattened without mirroring, packed for mip-mapping.
 
-Use it after remesh, or on a mesh file of your own. Texture coordinates that a mesh already has are kept when they are
-valid, unless --redo. With --symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts,
-checkerboard.png the mesh under them.
+Use it after remesh, or on a mesh file of your own. Valid texture coordinates of the mesh are kept, unless --redo. With
+--symmetry the halves of a symmetric mesh share their texels. layout.png shows the charts, checkerboard.png the mesh
+with a checkerboard in them.
 
 Example:
   gdtool unwrap cat.asset/mesh --size 2048
@@ -23,25 +23,35 @@ from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of unwrap."""
 
-    size: Annotated[int, Meta(ge=16, le=65536, description="texture size in texels that the padding is for")] = 2048
+    size: Annotated[int, Meta(ge=16, le=65536, description="Side of the texture that the padding is for, texels.")] = (
+        2048
+    )
     mip_safe: Annotated[
-        int, Meta(ge=1, le=65536, description="charts stay a texel apart down to the mip level of this size")
+        int,
+        Meta(
+            ge=1,
+            le=65536,
+            description="Side of the smallest mip level at which charts are still a texel apart, texels.",
+        ),
     ] = 256
     padding: Annotated[
-        int, Meta(ge=0, le=1024, description="texels between charts at --size; 0: what --mip-safe needs")
+        int, Meta(ge=0, le=1024, description="Texels between charts at --size; 0: as many as --mip-safe needs.")
     ] = 0
-    max_stretch: Annotated[float, Meta(gt=1, le=100, description="a chart with more L2 stretch is cut")] = 1.1
+    max_stretch: Annotated[
+        float, Meta(gt=1, le=100, description="Most L2 stretch of a chart; one with more is cut.")
+    ] = 1.1
     symmetry: Annotated[
-        Literal["none", "x", "y", "z"], Meta(description="faces that mirror others along this axis share their texels")
+        Literal["none", "x", "y", "z"],
+        Meta(description="Let faces that mirror others along this axis share their texels."),
     ] = "none"
-    redo: Annotated[bool, Meta(description="make new texture coordinates even where the mesh has valid ones")] = False
+    redo: Annotated[bool, Meta(description="Make new texture coordinates even where the mesh has valid ones.")] = False
     seconds: Annotated[
         float,
         Meta(
             gt=0,
             le=MOST_SECONDS,
-            description="time limit; charts are shaped in the first 60 % of it, what is left then goes in simpler "
-            "ways; after twice the limit and 5 s the run fails",
+            description="Time limit. Charts are shaped in the first 60 % of it, and simpler methods do the rest. After "
+            "twice the limit and 5 s the run fails.",
         ),
     ] = 120.0
 
@@ -52,10 +62,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
     cure = f"raise --seconds to {max(round(2 * options.seconds), 1)}, or run gdtool remesh with fewer --faces before"
     with held_to(options.seconds, "--seconds", inputs.name, cure):
-        _run(inputs, options, out)
+        _unwrap(inputs, options, out)
 
 
-def _run(inputs: Inputs, options: Options, out: Output) -> None:
+def _unwrap(inputs: Inputs, options: Options, out: Output) -> None:
+    """Unwrap one mesh and write the atlas."""
     from gdtool.geometry.simplify import CHILD_MODULES, collapse_in_child
 
     prepare(collapse_in_child, CHILD_MODULES)  # for the first child of unwrap(), while the mesh is read
@@ -100,7 +111,7 @@ def _run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
-    """Whether the mesh's own texture coordinates are kept; say so, or warn why they are not."""
+    """Tell whether the mesh's own texture coordinates are kept; record it, or warn why they are not."""
     from gdtool.unwrap.pipeline import invalid_reason
 
     if mesh.uv is None or options.redo:
@@ -114,7 +125,7 @@ def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
 
 
 def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output):
-    """Return the mesh with new texture coordinates, what was tried, and the twin (f,) of each face or -1."""
+    """Make new texture coordinates; returns the mesh, the failed attempts, and the twin (f,) of each face or -1."""
     import numpy as np
 
     from gdtool.geometry.meshes import QuadMesh
@@ -139,7 +150,7 @@ def _unwrapped(mesh, padding: int, options: Options, inputs: Inputs, out: Output
 
 
 def _report(mesh, twin, kept: bool, options: Options, inputs: Inputs, out: Output) -> dict:
-    """Return figures of the texture coordinates; warn of mirrored and overlapping charts."""
+    """Measure the texture coordinates; warn of mirrored and overlapping charts."""
     from gdtool.geometry.meshes import QuadMesh
     from gdtool.unwrap.pipeline import figures, texels_per_unit
 
@@ -169,7 +180,7 @@ def _with_wide_indices(mesh):
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
-    """Return twins and corners as mirror_twins() does; nothing has a twin without --symmetry."""
+    """Find twins and corners as mirror_twins() does; without --symmetry no face has a twin."""
     import numpy as np
 
     from gdtool.geometry.meshes import QuadMesh

@@ -1,4 +1,4 @@
-"""Conventions of cameras, on numbers that can be checked by hand."""
+"""Check the conventions of cameras on numbers that can be verified by hand."""
 
 import numpy as np
 import pytest
@@ -27,8 +27,10 @@ def test_nothing_is_mirrored():
     def at(view, point):
         return project(cameras[view], point[None])[0][0]
 
-    assert np.allclose(at("front", x), (75, 50)) and np.allclose(at("back", x), (25, 50))
-    assert np.allclose(at("front", y), (50, 25)) and np.allclose(at("left", z), (75, 50))
+    assert np.allclose(at("front", x), (75, 50))
+    assert np.allclose(at("back", x), (25, 50))
+    assert np.allclose(at("front", y), (50, 25))
+    assert np.allclose(at("left", z), (75, 50))
     assert np.allclose(at("right", z), (25, 50))
 
 
@@ -49,5 +51,6 @@ def test_rays_and_projection_are_inverse(fov):
 @pytest.mark.parametrize("position", [(0, 2, 0), (0, -2, 0), (1, 1, 1)])
 def test_poses_are_rigid_also_from_above(position):
     pose = look_at(position)
-    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3)) and np.isclose(np.linalg.det(pose[:3, :3]), 1)
+    assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
+    assert np.isclose(np.linalg.det(pose[:3, :3]), 1)
     assert np.allclose(-pose[:3, 2], -np.array(position) / np.linalg.norm(position))

@@ -1,4 +1,4 @@
-"""Each command's help, options, exit codes and streams."""
+"""Check each command's help, options, exit codes and streams."""
 
 import importlib
 import json
@@ -21,7 +21,7 @@ def options_of(name):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_says_what_it_is_for_with_an_example(gdtool_here, name):
+def test_help_has_a_description_and_an_example(gdtool_here, name):
     done = gdtool_here(name, "--help")
     assert done.returncode == 0
     assert done.stderr == ""
@@ -39,7 +39,7 @@ def test_every_option_has_a_help_text_in_one_style(name):
 
 
 @pytest.mark.parametrize("name", STAGES)
-def test_what_all_stages_take(name):
+def test_every_stage_has_the_common_options(name):
     wanted = {
         "-o",
         "--output",
@@ -63,7 +63,7 @@ def test_a_device_is_chosen_where_networks_run(name):
 
 
 @pytest.mark.parametrize("name", REPORTS)
-def test_what_all_reports_take(name):
+def test_every_report_has_the_common_options(name):
     assert {"--json", "--log-file", "-q", "-v", "--debug"} <= set(options_of(name))
 
 
@@ -97,7 +97,7 @@ def test_stdout_has_the_folder_and_nothing_else(gdtool, tmp_path):
     assert "render" in done.stderr
 
 
-def test_json_has_an_object_a_source(gdtool):
+def test_json_prints_one_object_per_source(gdtool):
     done = gdtool("render-dataset", "procedural:1", "--size", 16, "--samples", 4, "-o", "out", "--json", "-q")
     record = json.loads(done.stdout)
     assert record["folder"] == "out"
@@ -106,7 +106,7 @@ def test_json_has_an_object_a_source(gdtool):
     assert done.stderr == ""
 
 
-def test_a_dry_run_makes_nothing(gdtool, tmp_path):
+def test_a_dry_run_writes_nothing(gdtool, tmp_path):
     done = gdtool("render-dataset", "procedural:1", "-o", "out", "--dry-run")
     assert done.returncode == 0
     assert not (tmp_path / "out").exists()

@@ -1,4 +1,4 @@
-"""Protected children: results, errors, crashes, time and memory limits."""
+"""Call functions in child processes: results, errors, crashes, time and memory limits."""
 
 import os
 import subprocess
@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    """Children import this file."""
+    """Let children import this file."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
@@ -26,7 +26,7 @@ def double(array, noise=""):
 
 
 def of_own_type(arrays):
-    """Which are of numpy's own type, not of another that is equal to it; and the arrays."""
+    """Tell which arrays have a type object of numpy's own, and return the arrays too."""
     return [array.dtype is np.dtype(array.dtype.str) for array in arrays], arrays
 
 
@@ -51,7 +51,7 @@ def refuse():
 
 
 def read_by():
-    """The process, and whether a module that nobody needs is there."""
+    """Return the id of this process, and whether it has imported a module that nothing else needs."""
     return os.getpid(), "json.tool" in sys.modules
 
 
@@ -75,12 +75,12 @@ def grow():
     return np.ones(2**28)  # 2 GB
 
 
-def test_arrays_go_there_and_back_whatever_the_function_prints():
+def test_arrays_survive_the_round_trip_to_a_child_that_prints():
     assert (child.call(double, np.arange(5), noise="text", seconds=30) == np.arange(5) * 2).all()
 
 
-def test_numbers_there_and_back_are_of_numpys_own_types():
-    """ufunc.at takes ten times as long with types that are equal to these only; others come as they are."""
+def test_arrays_from_a_child_share_numpys_own_types():
+    """ufunc.at takes ten times as long with type objects that only equal numpy's."""
     numbers = [
         np.arange(2).astype(kind)
         for kind in (bool, np.int8, np.int32, np.uint64, np.float32, float, complex)
@@ -88,7 +88,8 @@ def test_numbers_there_and_back_are_of_numpys_own_types():
     ]
     others = [np.arange(5, dtype=">f8"), np.array(["a", "bc"]), np.array([(1, 2.0)], [("one", int), ("two", float)])]
     there, arrays = child.call(of_own_type, numbers + others, seconds=30)
-    assert all(there[: len(numbers)]) and all(of_own_type(arrays[: len(numbers)])[0])
+    assert all(there[: len(numbers)])
+    assert all(of_own_type(arrays[: len(numbers)])[0])
     assert all(
         one.dtype == other.dtype and (one == other).all() for one, other in zip(arrays, numbers + others, strict=True)
     )
@@ -140,7 +141,7 @@ def test_a_copy_of_this_process_does_not_use_its_waiting_children():
     os.wait()
 
 
-def test_children_that_were_begun_work_at_once_and_keep_their_limits():
+def test_children_run_in_parallel_within_their_limits():
     running = [child.begin(large, seconds=30) for _ in range(2)] + [child.begin(hang, seconds=1)]
     deadline = time.monotonic() + 30
     # Nobody has asked for a result yet.
@@ -152,7 +153,7 @@ def test_children_that_were_begun_work_at_once_and_keep_their_limits():
         running[2].result()
 
 
-def test_our_errors_come_back_as_themselves():
+def test_a_gdtool_error_in_a_child_is_raised_by_the_parent():
     with pytest.raises(InputError, match="mesh: is a bow-tie; cut it") as caught:
         child.call(refuse, seconds=30)
     assert caught.value.cure == "cut it"
@@ -167,16 +168,16 @@ def test_our_errors_come_back_as_themselves():
         ("grow", "more than 500 MB", {"seconds": 30, "memory_mb": 500}),
     ],
 )
-def test_everything_else_is_a_failure_with_its_reason(name, words, limits):
+def test_any_other_failure_of_a_child_names_its_reason(name, words, limits):
     with pytest.raises(child.ChildFailed, match=words):
         child.call(globals()[name], **limits)
 
 
-def test_a_childs_child_may_ask_for_more_than_the_child_has():
+def test_a_grandchild_may_ask_for_more_memory_than_its_parent_has():
     assert child.call(ask_for_more, seconds=30, memory_mb=4000).tolist() == [0, 2, 4]
 
 
-def test_a_childs_child_dies_with_it(tmp_path):
+def test_a_grandchild_dies_with_its_parent(tmp_path):
     child.call(leave_one_behind, tmp_path / "pid", seconds=30)
     pid = int((tmp_path / "pid").read_text())
     deadline = time.monotonic() + 5
@@ -186,13 +187,13 @@ def test_a_childs_child_dies_with_it(tmp_path):
 
 
 def below(pid):
-    """Processes that it started, and that these started."""
+    """List the processes that a process started, and those that they started."""
     own = [int(one) for one in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()]
     return own + [other for one in own for other in below(one)]
 
 
 def alive(pid):
-    """Whether a process runs (a zombie that nobody has reaped yet does not)."""
+    """Tell whether a process runs; a zombie that is not reaped yet does not."""
     try:
         with Path(f"/proc/{pid}/stat").open() as file:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"
@@ -216,10 +217,11 @@ def test_children_die_with_their_parent():
     parent.kill()
     parent.wait()
     time.sleep(0.3)
-    assert children and not any(alive(pid) for pid in children)
+    assert children
+    assert not any(alive(pid) for pid in children)
 
 
-def test_what_lies_in_the_folder_is_not_taken_for_a_module(tmp_path, monkeypatch):
+def test_a_child_imports_no_module_from_the_working_folder(tmp_path, monkeypatch):
     for name in ("socket", "pickle", "random", "numpy", "gdtool"):
         (tmp_path / f"{name}.py").write_text("raise SystemExit('not this one')")
     monkeypatch.chdir(tmp_path)

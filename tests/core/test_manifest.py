@@ -1,4 +1,4 @@
-"""What the format refuses, and that it says where and why."""
+"""Refuse faulty manifests, and name the place and the fault."""
 
 import json
 import shutil
@@ -65,7 +65,7 @@ def test_duplicate_keys_bad_json_and_missing_manifests(folder):
         open_folder(folder)
 
 
-def test_links_that_leave_the_folder_are_refused(folder):
+def test_links_out_of_the_folder_are_refused_in_manifests(folder):
     shutil.move(folder / "000.png", "outside.png")
     (folder / "000.png").symlink_to(Path("outside.png").absolute())
     with pytest.raises(InputError, match="link that leaves"):

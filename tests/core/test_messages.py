@@ -1,8 +1,8 @@
-"""Every error says what removes it, by an option that the command has: read from the source, so that no message is left
-out.
+"""Check that every error names a cure, and only options that its command has.
 
-Checked are all calls that construct an error of core/errors.py, and all calls of functions that take a `cure` and build
-one."""
+All messages are read from the source. Checked are the calls that construct an error of core/errors.py, and the calls of
+functions that take a `cure` and build one.
+"""
 
 import ast
 import importlib
@@ -37,7 +37,7 @@ EXCEPTIONS: dict[tuple[str, str], tuple[set[str], str]] = {
     ("gdtool/core/cluster.py", "_connected"): ({"--ray"}, "called where --ray was given, by the commands that have it"),
     ("gdtool/stages/early.py", "require_device"): ({"--device"}, "called by the commands whose stage runs networks"),
     ("gdtool/stages/early.py", "require_fov"): ({"--fov"}, "called by the stages that have --fov"),
-    ("commands/_common.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
+    ("commands/_options.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
 }
 
 FILES = {
@@ -57,7 +57,7 @@ MODULES = {module_of(file): file for file in FILES}
 
 @cache
 def options_of(command):
-    """All spellings of a command's options, and those of gdtool itself."""
+    """Return all spellings of a command's options, and of gdtool's own."""
     from gdtool.commands._group import cli
 
     found = importlib.import_module("gdtool.commands." + command.replace("-", "_")).command
@@ -70,8 +70,7 @@ def options_of(command):
 
 @cache
 def mentioned(module):
-    """Modules of gdtool that a module imports, wherever in it, or names in a string "module:function" for a child
-    process."""
+    """Return the modules of gdtool that a module imports anywhere, or names as "module:function" in a string."""
     found = set()
     for node in ast.walk(FILES[MODULES[module]]):
         if isinstance(node, ast.Import):
@@ -89,7 +88,7 @@ def mentioned(module):
 
 @cache
 def reached(module):
-    """A module and all that its imports lead to."""
+    """Return a module and all modules that its imports lead to."""
     seen, waiting = {module}, [module]
     while waiting:
         new = mentioned(waiting.pop()) - seen
@@ -99,7 +98,7 @@ def reached(module):
 
 
 def commands_of(file):
-    """The commands that can raise what stands in a file."""
+    """Return the commands that can raise the errors of a file."""
     module, folder, stem = module_of(file), file.split("/")[-2], Path(file).stem
     if stem.replace("_", "-") in COMMANDS and folder in ("stages", "commands"):
         return {stem.replace("_", "-")}
@@ -113,13 +112,13 @@ def functions(tree):
 
 
 def place_of_cure(function):
-    """Where `cure` is among the arguments of a call, None for one that is given by name only."""
+    """Return the position of `cure` among the arguments of a call; None where it is given by name only."""
     names = [argument.arg for argument in (*function.args.posonlyargs, *function.args.args)]
     return names.index("cure") - (names[:1] in (["self"], ["cls"])) if "cure" in names else None
 
 
 def default_cure(function):
-    """The default of a function's `cure`; None where it has none."""
+    """Return the default of a function's `cure`; None where it has none."""
     arguments = [*function.args.posonlyargs, *function.args.args]
     given = zip(arguments[len(arguments) - len(function.args.defaults) :], function.args.defaults, strict=True)
     return next(
@@ -155,7 +154,7 @@ def name_called(call):
 
 
 def constants_of(tree):
-    """Strings that have a name at the top of a module."""
+    """Return the strings that have a name at the top of a module."""
     return {
         node.targets[0].id: node.value
         for node in tree.body
@@ -173,7 +172,7 @@ def constants(file):
 
 
 def texts(node, known):
-    """The texts that an expression can be, what is not known of them as "…"; none where nothing is known."""
+    """Return the texts that an expression can be, with "…" for unknown parts; none where nothing is known."""
     if isinstance(node, ast.Constant):
         return [node.value] if isinstance(node.value, str) else []
     if isinstance(node, ast.JoinedStr):
@@ -197,7 +196,7 @@ def texts(node, known):
 
 
 class Message:
-    """A call that constructs an error: where it stands, and the expressions of its subject, fact and cure."""
+    """Hold a call that constructs an error: its place, and the expressions of its arguments."""
 
     def __init__(self, file, function, call):
         self.file, self.function, self.call, self.name = file, function, call, name_called(call)
@@ -238,9 +237,8 @@ MESSAGES = [message for file in FILES for message in messages_of(file)]
 
 
 def test_the_messages_are_found():
-    assert len(MESSAGES) > 150 and {"geometry", "bake", "diffusion", "images", "stages", "core"} <= {
-        m.file.split("/")[1] for m in MESSAGES
-    }
+    assert len(MESSAGES) > 150
+    assert {"geometry", "bake", "diffusion", "images", "stages", "core"} <= {m.file.split("/")[1] for m in MESSAGES}
 
 
 def test_every_error_has_a_cure():
@@ -257,8 +255,7 @@ def test_every_error_has_a_cure():
 
 
 def test_no_function_has_a_cure_of_nothing():
-    """A parameter `cure` has to be given, or has a default that says something; None stands for what the function says
-    itself."""
+    """A parameter `cure` has no default, or one that is not empty; with None the function supplies the text."""
     lacking = [
         f"{file}:{function.lineno} {function.name}"
         for file, function in TAKING
@@ -303,7 +300,7 @@ def test_cures_that_say_something_are_not_taken_for_generic(cure):
 
 
 def faults_of_options(text, commands):
-    """Options that a text names and that one of the commands has not."""
+    """Return the options that a text names and that one of the commands lacks."""
     text = FOREIGN.sub("", text)
     wrong = []
     for name, rest in OTHER.findall(text):
@@ -340,6 +337,6 @@ def test_rooms_are_reached_through_imports_and_child_functions():
     assert "unwrap" in commands_of("gdtool/unwrap/parameterize/schedule.py")
     assert commands_of("gdtool/core/errors.py") == set(COMMANDS)
     for (file, function), (allowed, reason) in EXCEPTIONS.items():
-        assert allowed and reason and any(one.name == function for one in functions(FILES[file])), (
-            f"{file}: {function} is gone"
-        )
+        assert allowed, f"{file}: {function} is gone"
+        assert reason, f"{file}: {function} is gone"
+        assert any(one.name == function for one in functions(FILES[file])), f"{file}: {function} is gone"

@@ -1,4 +1,4 @@
-"""Names inside files become paths below their folder, or errors."""
+"""Turn names inside files into paths below their folder, and refuse all others."""
 
 import pytest
 
@@ -10,25 +10,27 @@ UNFIT = ["", ".", "a\0b", "a\nb", "\ud800", "a\x7f", "x" * 256, "a/" * 2048 + "x
 
 
 @pytest.mark.parametrize("name", OUTSIDE + UNFIT)
-def test_what_is_no_path_below_the_folder(tmp_path, name):
+def test_names_that_leave_the_folder_are_refused(tmp_path, name):
     with pytest.raises(InputError) as caught:
         path_inside(tmp_path, name, "m.json", "file")
-    assert caught.value.cure and "\n" not in str(caught.value) and "\0" not in str(caught.value)
+    assert caught.value.cure
+    assert "\n" not in str(caught.value)
+    assert "\0" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["a/b", "a\\b", *OUTSIDE, *UNFIT[:-1]])
-def test_what_is_no_name(name):
+def test_text_that_cannot_be_a_name_is_refused(name):
     with pytest.raises(InputError):
         checked_name(name, "m.json", "object")
 
 
-def test_names_and_paths_that_are_right(tmp_path):
+def test_valid_names_and_paths_are_accepted(tmp_path):
     assert checked_name("Straße 3 (copy).v2", "m.json", "object") == "Straße 3 (copy).v2"
     assert path_inside(tmp_path, "./color/front.png", "m.json", "file") == tmp_path / "color/front.png"
     assert relative_parts("../../cat.png", "m.json", "input", levels_up=None) == ("..", "..", "cat.png")
 
 
-def test_links_that_leave(tmp_path):
+def test_links_out_of_the_folder_are_refused(tmp_path):
     inside = tmp_path / "inside"
     inside.mkdir()
     (tmp_path / "secret").write_text("x")
@@ -41,7 +43,7 @@ def test_links_that_leave(tmp_path):
     assert path_inside(inside, "near", "m.json", "file") == inside / "near"
 
 
-def test_one_level_up_is_not_two(tmp_path):
+def test_a_name_may_lead_up_one_level_but_not_two(tmp_path):
     folder = tmp_path / "a" / "b"
     folder.mkdir(parents=True)
     assert uri_path(folder, "../textures/x.png", "m.obj", "map_Kd", levels_up=1) == folder / "../textures/x.png"
@@ -58,7 +60,7 @@ def test_one_level_up_is_not_two(tmp_path):
             uri_path(folder, uri, "m.obj", "map_Kd", levels_up=1)
 
 
-def test_a_file_called_as_the_uri_is_written_goes_before(tmp_path):
+def test_a_file_named_like_the_undecoded_uri_comes_first(tmp_path):
     (tmp_path / "big%20ball.png").write_text("x")
     assert uri_path(tmp_path, "big%20ball.png", "m.gltf", "image").name == "big%20ball.png"
     assert uri_path(tmp_path, "small%20ball.png", "m.gltf", "image").name == "small ball.png"

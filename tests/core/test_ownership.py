@@ -1,4 +1,4 @@
-"""Nothing of the user's is lost: what may be replaced by an output, and what stops the command before any work."""
+"""Check that no run replaces a file of the user's, and that a refusal comes before any work."""
 
 import json
 import os
@@ -27,7 +27,8 @@ def tree(folder):
 
 def refused(*arguments, **settings):
     (error,) = run(*arguments, **settings)
-    assert isinstance(error, UsageError) and error.cure, error
+    assert isinstance(error, UsageError), error
+    assert error.cure, error
     return str(error)
 
 
@@ -39,7 +40,7 @@ def cat():
 
 @pytest.fixture
 def made(cat):
-    """A result at out/, and a source that makes it stale."""
+    """Make a result at out/ and a source that makes it stale."""
     run(cat, output=Path("out"))
     Path("cat.png").write_bytes(b"other")
     return Path("out")
@@ -128,10 +129,13 @@ def test_a_link_as_output_stays_and_its_target_is_judged(cat):
     Path("disk").mkdir()
     Path("out").symlink_to("disk")
     (result,) = run(cat, output=Path("out"))
-    assert result.path == Path("out") and Path("out").is_symlink() and open_folder(Path("disk")).name == "cat"
+    assert result.path == Path("out")
+    assert Path("out").is_symlink()
+    assert open_folder(Path("disk")).name == "cat"
     Path("disk/mine.txt").write_text("mine")
     assert "mine.txt" in refused(cat, output=Path("out"), force=True)
-    assert Path("out").is_symlink() and Path("disk/mine.txt").read_text() == "mine"
+    assert Path("out").is_symlink()
+    assert Path("disk/mine.txt").read_text() == "mine"
 
 
 def test_a_link_to_a_link_as_output(cat):
@@ -155,10 +159,11 @@ def test_files_put_there_while_the_run_works_stay(made, monkeypatch):
     (error,) = run_all(
         dataclasses.replace(STAGE, run=run_and_meddle), ("cat.png",), Options(), {}, Settings(output=made)
     )
-    assert "late.txt" in str(error) and (made / "late.txt").read_text() == "mine"
+    assert "late.txt" in str(error)
+    assert (made / "late.txt").read_text() == "mine"
 
 
-def test_the_sweep_touches_only_what_runs_of_this_output_left():
+def test_clearing_removes_only_what_runs_of_this_output_left():
     key, other = "0" * 12, "a" * 12
     kept = [
         f".out.v2.{key}.work",
@@ -189,7 +194,7 @@ def test_a_workspace_of_other_options_stays_until_the_output_is_finished(cat):
     assert not work.exists()
 
 
-def test_a_link_among_the_swept_names_is_not_followed():
+def test_clearing_does_not_follow_a_link():
     Path("mine").mkdir()
     Path("mine/file").write_text("x")
     name = Path(f".out.{'0' * 12}.partial")
@@ -216,12 +221,13 @@ def test_the_index_of_several_does_not_replace_a_manifest_of_the_users():
     Path("out/manifest.json").write_text('{"name": "my web app"}')
     with pytest.raises(UsageError, match="no manifest of gdtool's"):
         list(run_all(stage, ("a.png", "b.png"), Options(), {}, Settings(output=Path("out"), several=True)))
-    assert Path("out/manifest.json").read_text() == '{"name": "my web app"}' and not Path("out/a.asset").exists()
+    assert Path("out/manifest.json").read_text() == '{"name": "my web app"}'
+    assert not Path("out/a.asset").exists()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
 def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
-    """It could not be removed once it is replaced: it would be left beside the new one."""
+    """The replaced folder could not be removed, and would stay beside the new one."""
     os.chown(".", 65534, 65534)
     pid = os.fork()
     if not pid:
@@ -230,7 +236,8 @@ def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
         right = isinstance(error, OutputError) and "closed to writing" in str(error)
         os._exit(0 if right else 1)
     assert os.waitpid(pid, 0)[1] == 0
-    assert sorted(path.name for path in Path().iterdir()) == ["cat.png", "out"] and open_folder(made)
+    assert sorted(path.name for path in Path().iterdir()) == ["cat.png", "out"]
+    assert open_folder(made)
 
 
 def test_a_partial_folder_without_permissions_is_removed():

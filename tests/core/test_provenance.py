@@ -1,4 +1,4 @@
-"""Provenance is followed by path and digest."""
+"""Follow the provenance of a folder by path and by digest."""
 
 import dataclasses
 import shutil
@@ -10,7 +10,8 @@ from gdtool.core.errors import InputError
 from gdtool.core.folder import open_folder
 from gdtool.core.kinds import RendersContent
 from gdtool.core.provenance import ancestors, find_ancestor, find_source, missing_origin
-from gdtool.core.runner import Settings, run_all, second_inputs
+from gdtool.core.runner import Settings, run_all
+from gdtool.core.second_inputs import second_inputs
 from gdtool.core.stage import SecondInput
 from tests.core.toy import STAGE, Options
 
@@ -34,7 +35,7 @@ def run(stage, source, output):
 
 @pytest.fixture
 def chain():
-    """cat.png -> a/first -> a/second."""
+    """Make cat.png -> a/first -> a/second."""
     Path("cat.png").write_bytes(b"cat")
     Path("a").mkdir()
     run(STAGE, "cat.png", "a/first")
@@ -43,7 +44,8 @@ def chain():
 
 def test_the_chain_is_found_and_paths_stay_readable(chain):
     assert [folder.path for folder in ancestors(chain, CURE)] == [Path("a/first")]
-    assert Path(find_source(chain, CURE)).read_bytes() == b"cat" and missing_origin(chain, CURE) is None
+    assert Path(find_source(chain, CURE)).read_bytes() == b"cat"
+    assert missing_origin(chain, CURE) is None
 
 
 def test_a_folder_that_was_replaced_is_told_and_refused(chain):
@@ -66,7 +68,9 @@ def test_what_was_moved_is_told(chain):
     assert find_ancestor(chain, "views", CURE) is None
     assert missing_origin(chain, CURE).path == Path.cwd() / "a/first"
     (warning,) = second_inputs(NEXT, chain, {}).warnings
-    assert "a/first" in warning and "is gone" in warning and "--views" in warning
+    assert "a/first" in warning
+    assert "is gone" in warning
+    assert "--views" in warning
 
 
 def test_a_path_through_a_linked_folder_records_where_things_really_lie():

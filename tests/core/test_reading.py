@@ -1,4 +1,4 @@
-"""JSON is bounded where it enters, and only regular files are read."""
+"""Read bounded JSON, and regular files only."""
 
 import os
 import socket
@@ -27,13 +27,15 @@ from gdtool.core.reading import bytes_of, parse_json
         (b"", "line 1"),
     ],
 )
-def test_json_that_is_refused(text, said):
+def test_invalid_json_is_refused(text, said):
     with pytest.raises(InputError) as caught:
         parse_json(text, "x.json")
-    assert said in str(caught.value) and caught.value.cure and caught.value.subject == "x.json"
+    assert said in str(caught.value)
+    assert caught.value.cure
+    assert caught.value.subject == "x.json"
 
 
-def test_json_that_is_right():
+def test_valid_json_is_parsed():
     assert parse_json(b'\xef\xbb\xbf{"a": [1, -2.5e3, "\\ud83d\\ude00", "caf\\udce9", null, true]}', "x") == {
         "a": [1, -2500.0, "\U0001f600", "caf\udce9", None, True]
     }
@@ -59,7 +61,8 @@ def test_only_regular_files_are_read(tmp_path):
             )
             thread.start()
             thread.join(5)
-            assert answer and said in answer[0], name
+            assert answer, name
+            assert said in answer[0], name
     (tmp_path / "file").write_bytes(b"x")
     assert bytes_of(tmp_path / "file") == b"x"
 

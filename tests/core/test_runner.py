@@ -1,4 +1,4 @@
-"""The stage contract: where results go, when they are up to date, and that nothing half-written is ever seen."""
+"""Run a toy stage: where results go, when they are up to date, and that no half-written folder is ever visible."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def run(*arguments, options=None, **settings):
 
 
 def listen_to_interrupts():
-    """A shell starts background jobs deaf to SIGINT, and the tests may be one."""
+    """Restore SIGINT, which a shell ignores in background jobs, such as these tests may be."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
@@ -49,9 +49,11 @@ def leftovers(folder="."):
 def test_result_is_whole_and_described():
     Path("cat.png").write_bytes(b"cat")
     (result,) = run("cat.png")
-    assert str(result.path) == "cat.asset/renders" and result.status == "done"
+    assert str(result.path) == "cat.asset/renders"
+    assert result.status == "done"
     folder = open_folder(result.path)
-    assert folder.name == "cat" and folder.manifest.stage == "toy"
+    assert folder.name == "cat"
+    assert folder.manifest.stage == "toy"
     assert [f.path for f in folder.manifest.files] == ["000.png"]
     assert folder.manifest.inputs[0].path == "../../cat.png"
     assert folder.manifest.skipped[0].reason == "nothing to polish"
@@ -108,17 +110,18 @@ def test_equal_runs_have_equal_digests():
     assert read_manifest(first.path).key == read_manifest(second.path).key
 
 
-def test_another_source_of_the_same_name_needs_o():
+def test_another_source_of_the_same_name_needs_the_output_option():
     Path("a").mkdir()
     Path("cat.png").write_bytes(b"cat")
     Path("a/cat.png").write_bytes(b"cat")
     run("cat.png")
     (error,) = run("a/cat.png")
-    assert isinstance(error, UsageError) and "-o" in str(error)
+    assert isinstance(error, UsageError)
+    assert "-o" in str(error)
     assert run("a/cat.png", output=Path("other"))[0].status == "done"
 
 
-def test_o_is_the_folder_for_one_and_the_parent_for_several():
+def test_output_option_is_the_folder_of_one_source_and_the_parent_of_several():
     for name in "ab":
         Path(f"{name}.png").write_bytes(name.encode())
     assert run("a.png", output=Path("x"))[0].path == Path("x")
@@ -132,9 +135,12 @@ def test_one_bad_source_among_many():
     Path("good.png").write_bytes(b"good")
     Path("bad.png").write_bytes(b"bad")
     done = toy("bad.png", "good.png")
-    assert done.returncode == 1 and done.stdout == "good.asset/renders\n"
-    assert "gdtool: bad.png: is bad; give a good one" in done.stderr.splitlines() and "Traceback" not in done.stderr
-    assert toy("bad.png").returncode == 3 and not Path("bad.asset").exists()
+    assert done.returncode == 1
+    assert done.stdout == "good.asset/renders\n"
+    assert "gdtool: bad.png: is bad; give a good one" in done.stderr.splitlines()
+    assert "Traceback" not in done.stderr
+    assert toy("bad.png").returncode == 3
+    assert not Path("bad.asset").exists()
     assert toy("bad.png", "--debug").stderr.count("Traceback") == 1
 
 
@@ -144,7 +150,8 @@ def test_failed_run_keeps_the_old_result():
     before = Path("cat.asset/renders/manifest.json").read_bytes()
     Path("cat.png").write_bytes(b"bad")
     assert isinstance(run("cat.png")[0], InputError)
-    assert Path("cat.asset/renders/manifest.json").read_bytes() == before and leftovers() == []
+    assert Path("cat.asset/renders/manifest.json").read_bytes() == before
+    assert leftovers() == []
 
 
 def test_stdin_json_dry_run_and_exit_codes():
@@ -152,8 +159,10 @@ def test_stdin_json_dry_run_and_exit_codes():
     assert toy(stdin="").returncode == 2
     assert toy(stdin="cat.png\n").stdout == "cat.asset/renders\n"
     record = json.loads(toy("--json", stdin='{"folder": "cat.png"}\n').stdout)
-    assert record["status"] == "up to date" and record["folder"] == "cat.asset/renders"
-    assert toy("-n", "nothing.png").stdout == "nothing.asset/renders\n" and not Path("nothing.asset").exists()
+    assert record["status"] == "up to date"
+    assert record["folder"] == "cat.asset/renders"
+    assert toy("-n", "nothing.png").stdout == "nothing.asset/renders\n"
+    assert not Path("nothing.asset").exists()
     assert toy("nothing.png").returncode == 3
     assert toy("cat.png", "-o", "cat.png").returncode == 2
     assert toy("cat.png", "--repeat", "0").returncode == 2
@@ -173,7 +182,9 @@ def test_read_only_place_exits_4_and_missing_reader_141():
     pipe.stdout.readline()
     pipe.stdout.close()
     errors = pipe.stderr.read().decode()
-    assert pipe.wait() == 141 and "Traceback" not in errors and "Broken" not in errors
+    assert pipe.wait() == 141
+    assert "Traceback" not in errors
+    assert "Broken" not in errors
 
 
 def test_streams_a_source_as_soon_as_its_line_arrives():
@@ -205,7 +216,9 @@ def test_interrupted_leaves_nothing(sign, code):
         time.sleep(0.01)
     process.send_signal(sign)
     assert process.wait() == code
-    assert b"Traceback" not in process.stderr.read() and leftovers() == [] and not Path("cat.asset/renders").exists()
+    assert b"Traceback" not in process.stderr.read()
+    assert leftovers() == []
+    assert not Path("cat.asset/renders").exists()
 
 
 def test_killed_at_random_moments_the_old_or_the_new_is_there():
@@ -228,7 +241,8 @@ def test_killed_at_random_moments_the_old_or_the_new_is_there():
         folder = open_folder(Path("cat.asset/renders"))  # raises when a file is missing or cut
         assert folder.manifest.digest == old or len(folder.manifest.files) == 20
     assert toy("cat.png", "--repeat", "20").returncode == 0
-    assert len(open_folder(Path("cat.asset/renders")).manifest.files) == 20 and leftovers() == []
+    assert len(open_folder(Path("cat.asset/renders")).manifest.files) == 20
+    assert leftovers() == []
 
 
 def test_two_processes_on_one_output_do_not_mix():
@@ -246,13 +260,15 @@ def test_two_processes_on_one_output_do_not_mix():
     errors = [process.communicate()[1] for process in both]
     assert [process.returncode for process in both] == [0, 0]
     assert sum("up to date" in text for text in errors) == 1
-    assert len(open_folder(Path("cat.asset/renders")).manifest.files) == 20 and leftovers() == []
+    assert len(open_folder(Path("cat.asset/renders")).manifest.files) == 20
+    assert leftovers() == []
 
 
 def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
-    """A new bundled model makes old views stale: it is among the inputs that the key is made of."""
-    from gdtool.core.runner import second_inputs
+    """A new bundled model makes old views stale, since its digest is part of the key."""
+    from gdtool.core.second_inputs import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 
-    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).found["model"]
-    assert found.kind == "model" and found.name == "default"
+    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
+    assert found.kind == "model"
+    assert found.name == "default"

@@ -1,4 +1,4 @@
-"""What a source's digest depends on."""
+"""Check which files the digest of a source covers."""
 
 import pytest
 
@@ -21,4 +21,5 @@ def test_an_objs_digest_follows_its_library_and_textures_wherever_they_lie(tmp_p
     seen.append(digest(folder / "x.obj"))
     (folder / "x.mtl").write_text("newmtl n\nmap_Kd a b.png\n")
     seen.append(digest(folder / "x.obj"))
-    assert len(set(seen)) == 4 and digest(folder / "x.obj") == seen[-1]
+    assert len(set(seen)) == 4
+    assert digest(folder / "x.obj") == seen[-1]

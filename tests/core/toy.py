@@ -1,4 +1,4 @@
-"""A stage that needs nothing but core, for tests: copies its source and can be slow, fail or warn."""
+"""Define a stage that needs core only: it copies its source, and can be slow or fail."""
 
 import time
 from typing import Annotated
@@ -35,7 +35,7 @@ if __name__ == "__main__":
     from gdtool.commands import main
 
     def command():
-        from gdtool.commands._common import stage_command
+        from gdtool.commands._stage_command import stage_command
 
         return stage_command(STAGE, "Toy.")
 

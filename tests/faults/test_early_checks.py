@@ -29,7 +29,7 @@ def no_work(monkeypatch):
         monkeypatch.setattr(
             importlib.import_module("gdtool.commands." + stage.__name__.rpartition(".")[2]),
             "command",
-            importlib.import_module("gdtool.commands._common").stage_command(
+            importlib.import_module("gdtool.commands._stage_command").stage_command(
                 dataclasses.replace(stage.STAGE, run=run), "x"
             ),
         )

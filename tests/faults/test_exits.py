@@ -16,7 +16,7 @@ import click
 import numpy as np
 import pytest
 
-from gdtool.commands import _common, _group
+from gdtool.commands import _exit, _group, _stage_command
 from gdtool.core import child, ending, log, runner
 from gdtool.core.errors import GdtoolError, InputError, OutputError, ResourceError, from_exception
 from tests.conftest import ROOT
@@ -166,7 +166,7 @@ def test_any_exception_of_a_command_becomes_one_line(monkeypatch, capsys, raised
 
     monkeypatch.setattr(sys, "argv", ["gdtool", *(["--debug"] if debug else [])])
     with pytest.raises(SystemExit) as ended:
-        _common.guarded(command)
+        _exit.guarded(command)
     errors = capsys.readouterr().err
     assert ended.value.code == code
     assert ("Traceback" in errors) == debug
@@ -188,7 +188,7 @@ def test_an_unexpected_failure_of_one_source_does_not_stop_the_others(monkeypatc
 
     monkeypatch.setattr(sys, "argv", ["gdtool", *pictures, "-q"])
     with pytest.raises(SystemExit) as ended:
-        _common.guarded(_common.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
+        _exit.guarded(_stage_command.stage_command(dataclasses.replace(toy.STAGE, run=run), "Toy."))
     out, errors = capsys.readouterr()
     assert ended.value.code == 1
     assert out.split() == ["a.asset/renders", "c.asset/renders"]
@@ -202,7 +202,7 @@ def test_an_unexpected_failure_of_one_source_does_not_stop_the_others(monkeypatc
 @pytest.mark.parametrize("name", ["a\nb", "a\r\x1b[2J", "a\x85b\u2028c"], ids=ascii)
 def test_messages_are_one_line_whatever_characters_a_name_has(capsys, monkeypatch, name):
     monkeypatch.setattr(log, "level", log.NORMAL)
-    _common.report(InputError(name, f"is {name}", "mend it"))
+    _exit.report(InputError(name, f"is {name}", "mend it"))
     log.say(f"  {name}")
     errors = capsys.readouterr().err
     assert len(errors.splitlines()) == 2

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from gdtool.commands import COMMANDS
-from gdtool.commands._common import build_options
+from gdtool.commands._options import build_options
 from gdtool.core import sources
 from gdtool.core.errors import UsageError
 

@@ -63,7 +63,7 @@ def stage(name):
 
 if __name__ == "__main__":
     from gdtool.commands import main
-    from gdtool.commands._common import stage_command
+    from gdtool.commands._stage_command import stage_command
 
     name = sys.argv.pop(1)
     main(lambda: stage_command(stage(name), "Toy."))

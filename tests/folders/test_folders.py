@@ -1,4 +1,4 @@
-"""Each kind's files say what was written, to the precision that its page promises."""
+"""Write each kind of folder and read it again, to the precision that its page promises."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -52,13 +52,12 @@ def random_views(size=16):
 def test_views_come_back_within_their_quantisation():
     views = random_views()
     folder = written("views", lambda out: write_views(out, views, exposure=2.0))
-    assert (
-        folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic")
-        and folder.content.exposure == 2
-    )
+    assert folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic")
+    assert folder.content.exposure == 2
     back = read_views(folder)
     inside = views.mask > 0
-    assert np.array_equal(back.mask, views.mask) and np.array_equal(back.images["depth"], views.images["depth"])
+    assert np.array_equal(back.mask, views.mask)
+    assert np.array_equal(back.images["depth"], views.images["depth"])
     cosine = (back.images["normal"] * views.images["normal"]).sum(-1)[inside]
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 0.05
     for domain, bound in (("roughness", 0.5 / 255), ("metallic", 0.5 / 255), ("albedo", 0.005), ("color", 0.005)):
@@ -78,11 +77,9 @@ def test_cameras_come_back_and_bad_ones_are_refused():
     cameras = [camera_at(20, 10, name="a", size=8, fov_degrees=40), *rig("wonder3d", 8)]
     write_cameras(Path("c.json"), cameras)
     for before, after in zip(cameras, read_cameras(Path("c.json")), strict=True):
-        assert (
-            np.allclose(before.world_from_camera, after.world_from_camera, atol=1e-15)
-            and before.fx == after.fx
-            and before.name == after.name
-        )
+        assert np.allclose(before.world_from_camera, after.world_from_camera, atol=1e-15)
+        assert before.fx == after.fx
+        assert before.name == after.name
     text = Path("c.json").read_text()
     for old, new, words in (
         ('"near": 1.0', '"near": 9.0', "near 9 is not below far"),
@@ -103,9 +100,8 @@ def test_light_comes_back():
         "fit_error": {"rms": 0.1},
     }
     write_record(Path("l.json"), light)
-    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"]) and read_record(Path("l.json"))[
-        "fit_error"
-    ] == {"rms": 0.1}
+    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"])
+    assert read_record(Path("l.json"))["fit_error"] == {"rms": 0.1}
 
 
 def test_surface_comes_back_and_missing_properties_have_their_defaults():
@@ -121,19 +117,20 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
     )
     folder = written("surface", lambda out: write_surface(out, surface, watertight=True))
     back = read_surface(folder)
-    assert np.allclose(back.vertices, CUBE) and np.array_equal(back.faces, triangles)
-    assert np.abs(back.albedo - surface.albedo).max() < 0.005 and np.allclose(back.roughness, surface.roughness)
+    assert np.allclose(back.vertices, CUBE)
+    assert np.array_equal(back.faces, triangles)
+    assert np.abs(back.albedo - surface.albedo).max() < 0.005
+    assert np.allclose(back.roughness, surface.roughness)
     # A cube's corners point outward.
     assert np.allclose(back.normals, CUBE / np.linalg.norm(CUBE, axis=1, keepdims=True), atol=1e-6)
-    assert back.views is None and back.residual is None
+    assert back.views is None
+    assert back.residual is None
     seen = replace(surface, views=np.arange(n), residual=np.linspace(0, 0.7, n, dtype=np.float32))
     write_surface_ply(folder.file("surface.ply"), seen)
     back = read_surface(folder)
-    assert (
-        np.array_equal(back.views, seen.views)
-        and np.array_equal(back.residual, seen.residual)
-        and np.allclose(back.confidence, 0.5)
-    )
+    assert np.array_equal(back.views, seen.views)
+    assert np.array_equal(back.residual, seen.residual)
+    assert np.allclose(back.confidence, 0.5)
     bare = (
         b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float "
         b"z\n"
@@ -144,9 +141,10 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
     )
     folder.file("surface.ply").write_bytes(bare)
     back = read_surface(folder)
-    assert (
-        back.normals is None and np.allclose(back.albedo, 0.8) and back.roughness[0] == 0.5 and back.confidence[0] == 0
-    )
+    assert back.normals is None
+    assert np.allclose(back.albedo, 0.8)
+    assert back.roughness[0] == 0.5
+    assert back.confidence[0] == 0
     folder.file("surface.ply").write_bytes(bare[:-2])
     with pytest.raises(InputError, match="length"):
         read_surface(folder)
@@ -158,9 +156,9 @@ def test_quads_come_back_with_their_texture_coordinates():
     write_obj(Path("m.obj"), mesh)
     assert "vt 0 1" in Path("m.obj").read_text()  # the image's top left is OBJ's (0, 1)
     back = read_obj(Path("m.obj"))
-    assert (
-        np.array_equal(back.faces, QUADS) and np.array_equal(back.face_uvs, mesh.face_uvs) and np.allclose(back.uv, uv)
-    )
+    assert np.array_equal(back.faces, QUADS)
+    assert np.array_equal(back.face_uvs, mesh.face_uvs)
+    assert np.allclose(back.uv, uv)
     mixed = QuadMesh(CUBE, np.concatenate([QUADS[:5], [[1, 3, 7, -1], [1, 7, 5, -1]]]).astype(np.int32))
     write_obj(Path("m.obj"), mixed)
     assert np.array_equal(read_obj(Path("m.obj")).faces, mixed.faces)

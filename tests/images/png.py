@@ -1,4 +1,4 @@
-"""PNG files byte by byte, for what an encoder would not write."""
+"""Build PNG files byte by byte, in forms that an encoder would not write."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 def png(
     width: int, height: int, color: int, bits: int, scanlines: bytes, *, before: bytes = b"", interlaced: bool = False
 ) -> bytes:
-    """A PNG of filtered scanlines (each with its filter byte); `before` holds chunks between IHDR and IDAT."""
+    """Build a PNG of filtered scanlines (each with its filter byte); `before` holds chunks between IHDR and IDAT."""
     header = struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, int(interlaced))
     return (
         b"\x89PNG\r\n\x1a\n"
@@ -29,14 +29,14 @@ def png(
 
 
 def scanlines(image: np.ndarray) -> bytes:
-    """Unfiltered scanlines of (h, w, c) uint8 or uint16."""
+    """Return the unfiltered scanlines of (h, w, c) uint8 or uint16."""
     rows = image.astype(image.dtype.newbyteorder(">")).tobytes()
     stride = len(rows) // len(image)
     return b"".join(b"\0" + rows[i * stride : (i + 1) * stride] for i in range(len(image)))
 
 
 def adam7(image: np.ndarray) -> bytes:
-    """Scanlines of (h, w, c) uint8 in the seven passes of an interlaced PNG (PNG specification, section 8.2)."""
+    """Return the scanlines of an interlaced PNG in seven passes (PNG specification, section 8.2)."""
     passes = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
     parts = [image[y::dy, x::dx] for y, x, dy, dx in passes]
     return b"".join(scanlines(part) for part in parts if part.size)

@@ -1,3 +1,5 @@
+"""Encode and decode colors and normals."""
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,8 @@ def test_srgb_there_and_back(dtype):
 def test_eight_bit_codes_survive():
     codes = np.arange(256, dtype=np.uint8)
     linear = linear_from_srgb(codes)
-    assert linear.dtype == np.float32 and (np.diff(linear) > 0).all()
+    assert linear.dtype == np.float32
+    assert (np.diff(linear) > 0).all()
     np.testing.assert_array_equal(np.rint(srgb_from_linear(linear) * 255), codes)
 
 
@@ -34,7 +37,7 @@ def test_normals_there_and_back():
     assert angle.max() < 0.03  # float32 arccos near 1; the stored step is 0.002 degrees
 
 
-def test_the_middle_is_no_normal():
+def test_the_middle_value_decodes_to_the_zero_vector():
     for middle in (np.full(3, 0.5), np.full(3, 128, np.uint8), np.full(3, 127, np.uint8), np.full(3, 32768, np.uint16)):
         assert (decode_normal(middle) == 0).all()
 

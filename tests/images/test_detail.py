@@ -14,13 +14,13 @@ def disc():
     return (((x - SIZE / 2) ** 2 + (y - SIZE / 2) ** 2) < (0.4 * SIZE) ** 2).astype(float)
 
 
-def test_means_are_of_covered_pixels_only(disc):
+def test_masked_mean_leaves_out_uncovered_pixels(disc):
     values = np.where(disc[..., None] > 0, 0.7, 100.0) * np.ones(3)
     np.testing.assert_allclose(masked_mean(values, disc, 4.0)[disc > 0], 0.7, rtol=1e-9)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 1.5])
-def test_gain_is_how_much_of_the_detail_is_shared(disc, share):
+def test_detail_gain_is_the_share_of_common_detail(disc, share):
     rng = np.random.default_rng(0)
     one = rng.normal(0, 1, (SIZE, SIZE, 3))
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE
@@ -28,7 +28,7 @@ def test_gain_is_how_much_of_the_detail_is_shared(disc, share):
     np.testing.assert_allclose(detail_gain(one, other, disc)[disc > 0], share, atol=0.02)
 
 
-def test_what_is_linear_in_the_guide_comes_back_and_what_is_not_is_smoothed(disc):
+def test_guided_keeps_values_linear_in_the_guide_and_smooths_others(disc):
     rng = np.random.default_rng(1)
     guide = rng.normal(0, 1, (SIZE, SIZE, 3))
     linear = guide @ rng.normal(0, 1, (3, 3)) + 2.0
@@ -38,7 +38,7 @@ def test_what_is_linear_in_the_guide_comes_back_and_what_is_not_is_smoothed(disc
     assert guided(noise, guide, disc, 6.0, 1e-6)[inside].std() < 0.3 * noise[inside].std()
 
 
-def test_a_flat_guide_leaves_the_mean(disc):
+def test_a_constant_guide_gives_the_mean(disc):
     rng = np.random.default_rng(2)
     values, guide = rng.normal(0, 1, (SIZE, SIZE, 2)), np.ones((SIZE, SIZE, 3))
     np.testing.assert_allclose(

@@ -1,3 +1,5 @@
+"""Write and read image files, and refuse damaged, huge and unsupported ones."""
+
 import os
 import struct
 import subprocess
@@ -19,13 +21,15 @@ def picture() -> np.ndarray:
 
 
 def save(path, image: np.ndarray, **attributes) -> None:
-    """Write through OpenImageIO, with attributes of the spec."""
+    """Write an image through OpenImageIO, with attributes of the spec."""
     kind = {"uint8": "uint8", "uint16": "uint16", "float32": "float"}[image.dtype.name]
     spec = oiio.ImageSpec(image.shape[1], image.shape[0], image.shape[2], kind)
     for key, value in attributes.items():
         spec[key] = value
     out = oiio.ImageOutput.create(str(path))
-    assert out.open(str(path), spec) and out.write_image(np.ascontiguousarray(image)) and out.close()
+    assert out.open(str(path), spec)
+    assert out.write_image(np.ascontiguousarray(image))
+    assert out.close()
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -227,7 +231,7 @@ def test_exr_with_nan_names_the_pixel(tmp_path):
 
 
 @pytest.mark.parametrize("cut", [0.2, 0.5, 0.95])
-def test_truncated_exr_says_one_thing(tmp_path, cut, capfd):
+def test_a_truncated_exr_gives_one_error_line(tmp_path, cut, capfd):
     write_exr(tmp_path / "x.exr", np.random.default_rng(9).random((64, 64, 3)))
     content = (tmp_path / "x.exr").read_bytes()
     (tmp_path / "x.exr").write_bytes(content[: int(len(content) * cut)])
@@ -242,13 +246,16 @@ def test_several_pages_are_refused(tmp_path, picture):
     spec = oiio.ImageSpec(47, 33, 3, "uint8")
     path = str(tmp_path / "x.tif")
     out = oiio.ImageOutput.create(path)
-    assert out.open(path, (spec, spec)) and out.write_image(picture)
-    assert out.open(path, spec, "AppendSubimage") and out.write_image(picture) and out.close()
+    assert out.open(path, (spec, spec))
+    assert out.write_image(picture)
+    assert out.open(path, spec, "AppendSubimage")
+    assert out.write_image(picture)
+    assert out.close()
     with pytest.raises(InputError, match="several images"):
         read_image(path)
 
 
-def test_missing_and_folder(tmp_path):
+def test_a_missing_file_and_a_folder_are_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_image(tmp_path / "none.png")
     with pytest.raises(InputError, match="folder"):

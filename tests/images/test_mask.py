@@ -1,3 +1,5 @@
+"""Find the subject of synthetic pictures."""
+
 import numpy as np
 import pytest
 
@@ -13,8 +15,7 @@ def scene(
     gradient: float = 0.0,
     noise: float = 0.01,
 ):
-    """A disc of radius 0.5 with a hole of radius 0.2 on a background that darkens downward: (picture uint8,
-    coverage)."""
+    """Draw a disc of radius 0.5 with a hole of radius 0.2; returns picture (uint8) and coverage."""
     y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
     r = np.hypot(x - center[0], y - center[1])
     coverage = np.clip((0.5 - r) * size / 2 + 0.5, 0, 1) * np.clip((r - 0.2) * size / 2 + 0.5, 0, 1)
@@ -30,10 +31,11 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("gradient", [0.0, 0.4])
 @pytest.mark.parametrize("background", [(0.95, 0.95, 0.95), (0.2, 0.3, 0.35)])
-def test_a_plain_background_is_taken_away_with_the_hole(background, gradient):
+def test_a_plain_background_and_its_part_in_a_hole_are_removed(background, gradient):
     image, truth = scene(background=background, gradient=gradient)
     mask = foreground(image)
-    assert mask.shape == truth.shape and mask.dtype == np.float32
+    assert mask.shape == truth.shape
+    assert mask.dtype == np.float32
     assert overlap(mask, truth) > 0.95
     assert mask[80, 80] < 0.5
 
@@ -43,14 +45,14 @@ def test_larger_pictures_and_sixteen_bits():
     assert overlap(foreground(image.astype(np.uint16) * 257), truth) > 0.97
 
 
-def test_a_pale_part_inside_is_no_hole():
+def test_a_pale_part_of_the_subject_is_not_a_hole():
     image, _ = scene(background=(0.95, 0.95, 0.95))
     y, x = np.meshgrid(np.linspace(-1, 1, 160), np.linspace(-1, 1, 160), indexing="ij")
     image[np.hypot(x, y) < 0.2] = (215, 225, 235)  # near the background's white, but not it
     assert foreground(image)[80, 80] > 0.5
 
 
-def test_a_subject_at_the_border_is_found_and_told():
+def test_a_subject_at_the_border_is_found():
     image, truth = scene(center=(0.75, 0.0))
     mask = foreground(image)
     assert overlap(mask, truth) > 0.9
@@ -85,14 +87,14 @@ def test_a_given_mask_comes_before_everything():
         (scene()[0], np.ones((80, 160), np.uint8), "its mask"),
     ],
 )
-def test_what_has_no_subject_is_refused(image, mask, fact):
+def test_a_picture_without_a_subject_is_refused(image, mask, fact):
     with pytest.raises(InputError, match=fact) as caught:
         foreground(image, mask, "cat.png")
     assert str(caught.value).startswith("cat.png: ")
 
 
 def busy_scene(size: int = 320, contrast: float = 1.0):
-    """A reddish disc with stripes on leaves of greens and blues: (picture uint8, coverage)."""
+    """Draw a reddish disc with stripes on leaves of greens and blues; returns picture (uint8) and coverage."""
     y, x = np.meshgrid(np.linspace(-1, 1, size), np.linspace(-1, 1, size), indexing="ij")
     coverage = np.clip((0.55 - np.hypot(x, y)) * size / 2 + 0.5, 0, 1)
     leaves = np.repeat(np.repeat(np.random.default_rng(1).random((size // 8, size // 8, 1)), 8, 0), 8, 1)
@@ -103,12 +105,14 @@ def busy_scene(size: int = 320, contrast: float = 1.0):
     return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8), coverage
 
 
-def test_a_busy_background_is_cut_away_with_a_word_or_refused():
+def test_a_busy_background_is_removed_with_a_warning_or_refused():
     image, truth = busy_scene()
     told = []
     mask = foreground(image, None, "leaf.png", told.append)
-    assert mask.dtype == np.float32 and overlap(mask, truth) > 0.95
-    assert len(told) == 1 and told[0].startswith("leaf.png: the background is not plain")
+    assert mask.dtype == np.float32
+    assert overlap(mask, truth) > 0.95
+    assert len(told) == 1
+    assert told[0].startswith("leaf.png: the background is not plain")
     foreground(scene()[0], None, "plain.png", told.append)
     assert len(told) == 1
     np.testing.assert_array_equal(mask, foreground(image))  # the same every time

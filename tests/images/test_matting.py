@@ -1,3 +1,5 @@
+"""Cut out a subject by a tiny ONNX network."""
+
 import sys
 
 import numpy as np
@@ -11,7 +13,7 @@ from tests.images.test_mask import busy_scene, overlap
 
 @pytest.fixture
 def network(tmp_path):
-    """A file with U²-Net's interface, a single convolution inside: it finds what is more red than blue or green."""
+    """Write a network with U²-Net's interface and a single convolution, which finds red."""
     pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
     from onnx import TensorProto, helper, numpy_helper
@@ -37,7 +39,9 @@ def test_a_network_cuts_out_what_it_finds_on_any_background(network):
     image, truth = busy_scene(size=480)
     told = []
     mask = foreground(image, None, "leaf.png", told.append, network)
-    assert mask.shape == truth.shape and mask.dtype == np.float32 and not told
+    assert mask.shape == truth.shape
+    assert mask.dtype == np.float32
+    assert not told
     assert overlap(mask, truth) > 0.97
 
 

@@ -1,4 +1,4 @@
-"""Picture metrics on pictures whose answers are known."""
+"""Measure pictures for which the figures are known."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def test_psnr_of_a_constant_error(error, decibel):
     assert metrics.psnr(image + error, image) == pytest.approx(decibel)
 
 
-def test_psnr_where():
+def test_psnr_over_chosen_pixels():
     image, other = np.zeros((8, 8, 3)), np.zeros((8, 8, 3))
     other[:4] = 0.1
     upper = np.zeros((8, 8), bool)
@@ -36,7 +36,7 @@ def test_ssim_of_equal_and_of_constant_pictures():
     assert metrics.ssim(image, 1 - image) < 0.1
 
 
-def test_ssim_does_not_depend_on_the_range_that_a_picture_happens_to_have():
+def test_ssim_uses_a_fixed_range_of_one():
     dim = noise((64, 64)) * 0.1
     assert metrics.ssim(dim, dim + 0.05) == pytest.approx(
         metrics.ssim(np.pad(dim, 20), np.pad(dim + 0.05, 20), np.pad(np.ones((64, 64), bool), 20)), abs=0.1
@@ -51,7 +51,7 @@ def test_resized_is_the_average_over_area():
 
 
 def test_color_protocols():
-    """A square object whose sRGB value is 0.1 off: masked sees 20 dB, published the share of the frame it covers."""
+    """A square object is off by 0.1 in sRGB: masked gives 20 dB, published depends on the share of the frame."""
     mask = np.zeros((1, 256, 256), np.float32)
     mask[:, 64:192, 64:192] = 1  # a quarter of the frame
     a, b = (linear_from_srgb(np.full((1, 256, 256, 3), value)) * mask[..., None] for value in (0.5, 0.6))
@@ -65,7 +65,8 @@ def test_a_missing_object_is_black_in_the_mask_and_white_in_the_frame():
     mask = np.ones((1, 256, 256), np.float32)
     white = np.ones((1, 256, 256, 3), np.float32)
     found = metrics.color_metrics(white * 0, mask * 0, white, mask)
-    assert found["psnr_masked"] == pytest.approx(0, abs=1e-5) and found["psnr_published"] == 100
+    assert found["psnr_masked"] == pytest.approx(0, abs=1e-5)
+    assert found["psnr_published"] == 100
 
 
 def test_psnr_is_of_each_picture_and_then_the_mean():
@@ -76,7 +77,7 @@ def test_psnr_is_of_each_picture_and_then_the_mean():
     assert metrics.color_metrics(a, mask, b, mask)["psnr_masked"] == pytest.approx((20 + 100) / 2, abs=1e-3)
 
 
-def test_partly_covered_pixels_are_no_foreground():
+def test_partly_covered_pixels_do_not_count_as_foreground():
     mask = np.ones((1, 256, 256), np.float32)
     mask[:, :, 128:] = 0.5
     a = np.zeros((1, 256, 256))
@@ -136,11 +137,12 @@ def test_nothing_in_common_gives_no_figure():
 
 
 def test_views_are_resized_over_what_they_cover():
-    """A half covered new pixel keeps the value of its covered half; a mean of normals is a unit vector."""
+    """A half covered new pixel keeps the value of its covered half; a mean of normals is made unit."""
     mask = np.zeros((1, 4, 4), np.float32)
     mask[:, :, :1] = 1
     normal = np.zeros((1, 4, 4, 3), np.float32)
     normal[:, ::2, 0], normal[:, 1::2, 0] = (1, 0, 0), (0, 1, 0)
     images, small = metrics.resized_views({"depth": 2 * mask, "normal": normal}, mask, 2, 2)
-    assert small[0].tolist() == [[0.5, 0]] * 2 and images["depth"][0].tolist() == [[2, 0]] * 2
+    assert small[0].tolist() == [[0.5, 0]] * 2
+    assert images["depth"][0].tolist() == [[2, 0]] * 2
     np.testing.assert_allclose(images["normal"][0, 0], [[0.5**0.5, 0.5**0.5, 0], [0, 0, 0]], atol=1e-6)

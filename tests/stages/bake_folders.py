@@ -1,4 +1,4 @@
-"""Atlas, surface and views folders of a torus, as stages would leave them, for tests of bake."""
+"""Write atlas, surface and views folders of a torus, as stages would, for tests of bake."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def finish(path: Path, kind: str, content, inputs: dict[str, Path]) -> Path:
 
 
 def fresh(path: Path) -> Output:
-    """An Output that writes straight into path."""
+    """Make an Output that writes into path."""
     path.mkdir(parents=True)
     return Output(path, path.with_name("work"), 1, "cpu")
 
 
 def torus_views(size: int = 96) -> Views:
-    """Six true views of the torus: albedo, roughness, metallic, normal."""
+    """Render six true views of the torus: albedo, roughness, metallic, normal."""
     vertices, quads, normals = torus(160, 90)
     faces = triangles_of(quads)
     caster = RayCaster(TriMesh(vertices, faces))
@@ -72,8 +72,10 @@ def torus_views(size: int = 96) -> Views:
 
 
 def make_chain(root: Path, *, with_views: bool = True, gray_vertices: bool = False) -> Path:
-    """root/views, surface, atlas, each made from the one before; the atlas folder. gray_vertices: colour only in
-    views."""
+    """Write root/views, surface and atlas, each made from the one before; returns the atlas folder.
+
+    gray_vertices: only the views have color.
+    """
     made_from: dict[str, Path] = {}
     if with_views:
         out = fresh(root / "views")
@@ -94,7 +96,7 @@ def make_chain(root: Path, *, with_views: bool = True, gray_vertices: bool = Fal
 
 
 def torus_atlas() -> QuadMesh:
-    """A coarse torus of quads with xatlas charts."""
+    """Make a coarse torus of quads with xatlas charts."""
     vertices, quads, _ = torus(36, 18, minor=0.141)
     uv, face_uvs = unwrapped(vertices, triangles_of(quads), 256)
     corners = face_uvs.reshape(-1, 2, 3)
@@ -112,7 +114,7 @@ def torus_atlas() -> QuadMesh:
 
 
 def write_atlas(path: Path, inputs: dict[str, Path], mesh: QuadMesh | None = None) -> Path:
-    """An atlas folder."""
+    """Write an atlas folder."""
     mesh = mesh or torus_atlas()
     out = fresh(path)
     write_mesh(out, mesh)

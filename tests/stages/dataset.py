@@ -1,4 +1,4 @@
-"""A dataset of analytic spheres, published by the runner as render-dataset would."""
+"""Publish a dataset of analytic spheres by the runner, as render-dataset would."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ SPHERES = Stage(
 
 
 def write_spheres(root: Path, count: int = 3, **options) -> Path:
-    """root/procedural-*.asset/views and root/manifest.json of count spheres."""
+    """Write root/procedural-*.asset/views of count spheres, and the index root/manifest.json."""
     results = list(
         run_all(SPHERES, (f"procedural:0..{count - 1}",), Options(**options), {}, Settings(output=root, several=True))
     )
-    assert len(results) == count and all(result.status == "done" for result in results)
+    assert len(results) == count
+    assert all(result.status == "done" for result in results)
     return root

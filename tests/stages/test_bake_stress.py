@@ -18,7 +18,7 @@ FAST = ("--size", 64, "--ao-rays", 4)
 
 
 def slab(thickness=0.001):
-    """A closed plate, 1 x 1 x thickness: vertices (8, 3), quads (6, 4), a texture rectangle of its own for each."""
+    """Make a closed plate, 1 x 1 x thickness: vertices (8, 3), quads (6, 4), a texture rectangle for each quad."""
     x = np.array([-0.5, 0.5])
     vertices = np.array([[a, b, c] for a in x for b in x for c in x * thickness])
     # Front and back first.
@@ -29,7 +29,7 @@ def slab(thickness=0.001):
 
 
 def colored(vertices, quads, uv, corners, colors):
-    """A Scene whose quads have the texture colors (6, 3), 8 bits, in their rectangles."""
+    """Make a Scene whose quads have the texture colors (6, 3), 8 bits, in their rectangles."""
     image = np.zeros((48, 48, 3), np.uint8)
     for k, color in enumerate(colors):
         image[k // 3 * 16 : k // 3 * 16 + 16, k % 3 * 16 : k % 3 * 16 + 16] = color
@@ -45,7 +45,7 @@ COLORS = (RED, BLUE, GRAY, GRAY, GRAY, GRAY)
 
 
 def bake(gdtool, mesh, scene, *options):
-    """The asset's base color (s, s, 3) and manifest content."""
+    """Bake, and return the asset's base color (s, s, 3) and manifest content."""
     write_obj(Path("low.obj"), mesh)
     write_glb(Path("high.glb"), scene)
     done = gdtool("bake", "low.obj", "--model", "high.glb", *(options or FAST), "-o", "out")
@@ -56,7 +56,7 @@ def bake(gdtool, mesh, scene, *options):
 
 
 def middle(image, k):
-    """The texel in the middle of the k-th rectangle."""
+    """Return the texel in the middle of the k-th rectangle."""
     size = len(image)
     return image[int((k // 3 + 0.5) / 3 * size), int((k % 3 + 0.5) / 3 * size)]
 
@@ -132,4 +132,5 @@ def test_a_failed_bake_keeps_the_asset_that_was_there(gdtool):
     before = Path("out/asset.glb").read_bytes()
     write_obj(Path("low.obj"), QuadMesh(vertices, quads, uv * 1e-7, corners))
     done = gdtool("bake", "low.obj", "--model", "high.glb", *FAST, "-o", "out")
-    assert done.returncode == 3 and Path("out/asset.glb").read_bytes() == before
+    assert done.returncode == 3
+    assert Path("out/asset.glb").read_bytes() == before

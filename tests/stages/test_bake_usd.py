@@ -1,4 +1,4 @@
-"""gdtool bake --usd: the OpenUSD file says what the .glb says (needs usd-core)."""
+"""Run gdtool bake --usd, and compare the OpenUSD file with the .glb (needs usd-core)."""
 
 import json
 import shutil
@@ -18,7 +18,8 @@ def test_without_its_package_it_says_what_to_install(gdtool, tmp_path):
     (tmp_path / "pxr" / "__init__.py").write_text("raise ImportError\n")
     (tmp_path / "x.obj").write_text("v 0 0 0\n")
     done = gdtool("bake", "x.obj", "--usd", "usda", env={"PYTHONPATH": str(tmp_path)})
-    assert done.returncode == 5 and "gdtool[usd]" in done.stderr
+    assert done.returncode == 5
+    assert "gdtool[usd]" in done.stderr
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +36,13 @@ def test_geometry_and_material_are_the_assets(gdtool, chain, tmp_path, conventio
     assert done.returncode == 0, done.stderr
     assert gdtool("validate", "out").returncode == 0
     stage = Usd.Stage.Open(str(tmp_path / "out" / "asset.usda"))
-    assert UsdGeom.GetStageUpAxis(stage) == "Y" and stage.GetDefaultPrim().GetPath() == "/asset"
+    assert UsdGeom.GetStageUpAxis(stage) == "Y"
+    assert stage.GetDefaultPrim().GetPath() == "/asset"
     mesh, obj = UsdGeom.Mesh(stage.GetPrimAtPath("/asset/mesh")), read_obj(tmp_path / "out" / "asset.obj")
     np.testing.assert_allclose(mesh.GetPointsAttr().Get(), obj.vertices, atol=1e-6)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get())
-    assert (counts == np.where(obj.is_quad, 4, 3)).all() and (counts == 4).sum() > 500
+    assert (counts == np.where(obj.is_quad, 4, 3)).all()
+    assert (counts == 4).sum() > 500
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     own = obj.uv[obj.face_uvs[obj.face_uvs >= 0]]
     np.testing.assert_allclose(np.array(st.ComputeFlattened()) * [1, -1] + [0, 1], own, atol=1e-6)
@@ -64,11 +67,10 @@ def test_geometry_and_material_are_the_assets(gdtool, chain, tmp_path, conventio
         ("normal", "normal", "rgb", "raw"),
     ]:
         shader, channel = source(name)
-        assert channel == output and shader.GetInput("sourceColorSpace").Get() == space
-        assert (
-            shader.GetInput("file").Get().path == f"./{map_name}.png"
-            and (tmp_path / "out" / f"{map_name}.png").is_file()
-        )
+        assert channel == output
+        assert shader.GetInput("sourceColorSpace").Get() == space
+        assert shader.GetInput("file").Get().path == f"./{map_name}.png"
+        assert (tmp_path / "out" / f"{map_name}.png").is_file()
     normal = source("normal")[0]
     up = 1 if convention == "opengl" else -1
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""gdtool evaluate by its command line: an egg, its views, a surface and quads made from them, known errors put in."""
+"""Run gdtool evaluate on views, a surface and quads of an egg with known errors."""
 
 import json
 from dataclasses import replace
@@ -26,14 +26,14 @@ MATRIX = np.array([[SIZE, 0, 0, 3], [0, SIZE, 0, -2], [0, 0, SIZE, 10], [0, 0, 0
 
 
 def egg(subdivisions=3):
-    """Triangles with longest side 1 (along y), asymmetric, normalised frame."""
+    """Make triangles with longest side 1 (along y), asymmetric, in the normalised frame."""
     mesh = trimesh.creation.icosphere(subdivisions, 0.5)
     vertices = np.asarray(mesh.vertices) * [0.6, 1, 0.8]
     return vertices, np.asarray(mesh.faces, np.int32)
 
 
 def egg_views(vertices, faces, size=48):
-    """Six true views with all that is constant on an egg of one material."""
+    """Render six true views of an egg of one material."""
     from gdtool.assets.scene import Material, Scene
     from gdtool.shading.render.render import Renderer
 
@@ -66,7 +66,7 @@ def write_egg_surface(path, inputs, scale=1.0, matrix=MATRIX):
 
 @pytest.fixture
 def chain(tmp_path):
-    """egg.obj (in its own frame) → egg.asset/views → surface (5 % too small, roughness 0.1 too low)."""
+    """Write egg.obj (in its own frame) → egg.asset/views → surface (5 % too small, roughness 0.1 too low)."""
     vertices, faces = egg()
     trimesh.Trimesh(vertices * SIZE + CENTER, faces, process=False).export(tmp_path / "egg.obj")
     root = tmp_path / "egg.asset"
@@ -83,7 +83,7 @@ def chain(tmp_path):
 
 
 def measured(result, reference=None, **options):
-    """The stage itself, in this process: a command takes seconds to start, and test_the_command runs it."""
+    """Call the stage in this process, since a command takes seconds to start; test_the_command runs the command."""
     found, against = (
         None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference)
     )
@@ -93,31 +93,35 @@ def measured(result, reference=None, **options):
 def test_the_truth_and_the_views_are_found_along_the_provenance(chain):
     found = measured(chain / "surface")
     assert all(isinstance(value, (bool, int, float, str)) for value in found.values())  # flat
-    assert (
-        found["result"] == "egg"
-        and found["kind"] == "surface"
-        and found["watertight"]
-        and found["reference_watertight"]
-    )
-    assert found["vertices"] == len(egg()[0]) and found["faces"] == len(egg()[1]) and found["quads"] == 0
+    assert found["result"] == "egg"
+    assert found["kind"] == "surface"
+    assert found["watertight"]
+    assert found["reference_watertight"]
+    assert found["vertices"] == len(egg()[0])
+    assert found["faces"] == len(egg()[1])
+    assert found["quads"] == 0
     # 5 % of a radius of 0.3 to 0.5, some less along the normal: the frame of the model was undone.
     assert 0.014 < found["surface_distance"] < 0.025
     assert found["surface_iou"] == pytest.approx(0.95**3, abs=0.01)
-    assert found["surface_normal_degrees"] < 3 and found["surface_flipped_share"] == 0
-    assert (
-        found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1) and 0.8 < found["seen_share"] <= 1
-    )
+    assert found["surface_normal_degrees"] < 3
+    assert found["surface_flipped_share"] == 0
+    assert found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1)
+    assert 0.8 < found["seen_share"] <= 1
 
 
 def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
     found = measured(chain / "surface")
-    assert found["views"] == 6 and found["reference_views"] == "egg"
+    assert found["views"] == 6
+    assert found["reference_views"] == "egg"
     assert found["mask_iou"] == pytest.approx(0.95**2, abs=0.01)
     assert found["depth_error"] == pytest.approx(0.02, abs=0.01)
     true_size = write_egg_surface(chain / "exact", {"source": chain / "views"})
     exact = measured(true_size)
-    assert exact["mask_iou"] > 0.999 and exact["albedo_psnr_masked"] > 45 and exact["depth_error"] < 1e-3
-    assert exact["roughness_error"] == pytest.approx(0.1, abs=0.005) and exact["metallic_error"] < 0.005
+    assert exact["mask_iou"] > 0.999
+    assert exact["albedo_psnr_masked"] > 45
+    assert exact["depth_error"] < 1e-3
+    assert exact["roughness_error"] == pytest.approx(0.1, abs=0.005)
+    assert exact["metallic_error"] < 0.005
     assert exact["normal_degrees"] < 3  # smooth against flat facets of 1/8 of a quarter circle
     assert "albedo_psnr_masked" not in measured(true_size, render=False)
 
@@ -134,7 +138,7 @@ def test_views_named_as_the_reference_come_before_those_along_the_provenance(cha
     assert measured(exact, rougher)["roughness_error"] == pytest.approx(0.25, abs=0.005)
 
 
-def test_reference_by_name_in_each_form(chain, tmp_path):
+def test_every_kind_of_reference_is_accepted(chain, tmp_path):
     surface = chain / "surface"
     own = measured(surface)
     by_file = measured(surface, tmp_path / "egg.obj")
@@ -146,13 +150,14 @@ def test_reference_by_name_in_each_form(chain, tmp_path):
     # surface.ply is float32: the samples fall on the same points but for rounding
     assert by_surface["surface_distance"] == pytest.approx(own["surface_distance"], rel=1e-3)
     by_box = measured(exact, tmp_path / "egg.obj", frame="box")
-    assert by_box["surface_distance"] < 1e-5 and by_box["surface_f_score"] == 1
+    assert by_box["surface_distance"] < 1e-5
+    assert by_box["surface_f_score"] == 1
     moved = measured(exact, tmp_path / "egg.obj", frame="same")
     assert moved["surface_distance"] > 0.1
 
 
 def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
-    """source.glb stands in the frame of the views."""
+    """source.glb is in the frame of the views."""
     from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.scene import Scene
 
@@ -162,7 +167,8 @@ def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
     write_glb(out.path("source.glb"), Scene(vertices, faces))
     finish(tmp_path / "carrying", "views", out.content, {})
     found = measured(write_egg_surface(chain / "exact", {}), tmp_path / "carrying", render=False)
-    assert found["surface_distance"] < 1e-5 and "seen_distance" in found
+    assert found["surface_distance"] < 1e-5
+    assert "seen_distance" in found
 
 
 def test_a_result_from_a_picture_is_measured_in_the_unit_box(chain, tmp_path):
@@ -170,7 +176,7 @@ def test_a_result_from_a_picture_is_measured_in_the_unit_box(chain, tmp_path):
     assert measured(pictured, tmp_path / "egg.obj")["surface_distance"] < 1e-5
 
 
-def test_quads_and_their_seen_part(chain):
+def test_a_quad_mesh_is_measured_with_its_seen_part(chain):
     """A box of quads: counts, a closed shell, views found behind the surface."""
     box = trimesh.creation.box((0.6, 1, 0.8))
     corners = np.asarray(box.vertices)
@@ -185,10 +191,12 @@ def test_quads_and_their_seen_part(chain):
     )
     finish(chain / "mesh", "mesh", content, {"source": chain / "surface"})
     found = measured(chain / "mesh")
-    assert (found["vertices"], found["quads"], found["faces"]) == (8, 6, 6) and found["watertight"]
+    assert (found["vertices"], found["quads"], found["faces"]) == (8, 6, 6)
+    assert found["watertight"]
     assert found["surface_flipped_share"] == pytest.approx(0, abs=0.02)
     assert found["surface_iou"] == pytest.approx(np.pi / 6 * 1.1**3 / 1.1**3, abs=0.02)  # an ellipsoid in its box
-    assert "seen_distance" in found and "albedo_psnr_masked" not in found  # a bare mesh has nothing to render
+    assert "seen_distance" in found
+    assert "albedo_psnr_masked" not in found  # a bare mesh has nothing to render
     found = measured(chain / "mesh", chain / "surface")
     assert found["surface_accuracy"] > 0.05
 
@@ -198,10 +206,13 @@ def test_files_against_files_and_a_hole(tmp_path):
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "a.ply")
     trimesh.Trimesh(vertices, faces[5:], process=False).export(tmp_path / "b.ply")
     found = measured("b.ply", "a.ply")
-    assert not found["watertight"] and found["reference_watertight"] and found["faces"] == len(faces) - 5
+    assert not found["watertight"]
+    assert found["reference_watertight"]
+    assert found["faces"] == len(faces) - 5
     assert found["surface_accuracy"] < 1e-6 < found["surface_completeness"]
     back = measured("a.ply", "b.ply")
-    assert "surface_iou" not in back and not back["reference_watertight"]
+    assert "surface_iou" not in back
+    assert not back["reference_watertight"]
 
 
 def shifted(views, path, **changes):
@@ -218,21 +229,26 @@ def test_views_against_views(chain, tmp_path):
     del images["metallic"]
     other = shifted(truth, tmp_path / "other", images=images)
     found = measured(other, chain / "views")
-    assert found["kind"] == "views" and found["views"] == 6 and found["mask_iou"] == 1
+    assert found["kind"] == "views"
+    assert found["views"] == 6
+    assert found["mask_iou"] == 1
     for name in ("color_psnr_published", "color_psnr_masked", "albedo_psnr_masked"):
         assert found[name] == 100, name
-    assert found["color_ssim_published"] == pytest.approx(1) and found["normal_degrees"] < 0.01
-    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003) and found["depth_error"] == pytest.approx(
-        0.01, abs=1e-5
-    )
-    assert "metallic_error" not in found and "surface_distance" not in found
+    assert found["color_ssim_published"] == pytest.approx(1)
+    assert found["normal_degrees"] < 0.01
+    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003)
+    assert found["depth_error"] == pytest.approx(0.01, abs=1e-5)
+    assert "metallic_error" not in found
+    assert "surface_distance" not in found
 
 
 def test_views_of_another_size_and_of_other_cameras(chain, tmp_path):
     vertices, faces = egg()
     large = shifted(egg_views(vertices, faces, 96), tmp_path / "large")
     found = measured(large, chain / "views")
-    assert found["mask_iou"] > 0.99 and found["normal_degrees"] < 1 and found["color_psnr_masked"] > 45
+    assert found["mask_iou"] > 0.99
+    assert found["normal_degrees"] < 1
+    assert found["color_psnr_masked"] > 45
     turned = shifted(
         replace(egg_views(vertices, faces), cameras=[replace(c, half_width=0.5) for c in rig("six", 48)]),
         tmp_path / "turned",
@@ -252,7 +268,7 @@ def test_renders_against_renders(tmp_path):
     assert found["color_psnr_masked"] == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
 
 
-def test_what_cannot_be_compared_is_said(chain, tmp_path):
+def test_results_that_cannot_be_compared_are_refused(chain, tmp_path):
     with pytest.raises(UsageError, match="--reference"):
         measured(tmp_path / "egg.obj")
     with pytest.raises(InputError, match="run gdtool render-dataset"):
@@ -264,17 +280,25 @@ def test_what_cannot_be_compared_is_said(chain, tmp_path):
 def test_the_command(gdtool, chain):
     """One flat JSON object with both protocols, the same each time; a table; bad ones among many."""
     one, two = (gdtool("evaluate", chain / "surface", "--json", "--samples", 500) for _ in range(2))
-    assert one.returncode == 0 and one.stdout == two.stdout and one.stderr == ""
+    assert one.returncode == 0
+    assert one.stdout == two.stdout
+    assert one.stderr == ""
     found = json.loads(one.stdout)
-    assert (
-        found["syncdreamer_chamfer"] > 0 and found["surface_distance"] > 0 and found["path"] == str(chain / "surface")
-    )
+    assert found["syncdreamer_chamfer"] > 0
+    assert found["surface_distance"] > 0
+    assert found["path"] == str(chain / "surface")
     assert all(isinstance(value, (bool, int, float, str)) for value in found.values())
 
     done = gdtool("evaluate", "--samples", 500, "--no-syncdreamer", stdin=f"{chain / 'surface'}\n{chain / 'nothing'}\n")
-    assert done.returncode == 1 and "does not exist" in done.stderr and "Traceback" not in done.stderr
-    assert done.stdout.startswith("egg (surface)") and "surface protocol" in done.stdout and "watertight" in done.stdout
+    assert done.returncode == 1
+    assert "does not exist" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout.startswith("egg (surface)")
+    assert "surface protocol" in done.stdout
+    assert "watertight" in done.stdout
 
     done = gdtool("evaluate", "none.glb", "--reference", "egg.obj")
-    assert done.returncode == 3 and "none.glb: does not exist" in done.stderr and done.stdout == ""
+    assert done.returncode == 3
+    assert "none.glb: does not exist" in done.stderr
+    assert done.stdout == ""
     assert gdtool("evaluate").returncode == 2

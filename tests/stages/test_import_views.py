@@ -1,4 +1,4 @@
-"""gdtool import-views by its command line, on folders written as Wonder3D, NeRF tools and a user write them."""
+"""Run gdtool import-views on folders as Wonder3D, NeRF tools and a user write them."""
 
 import json
 
@@ -19,7 +19,7 @@ SIZE = 64
 
 
 def lopsided(points):
-    """A ball with a smaller one in front at the upper right: no axis can be swapped or turned over unnoticed."""
+    """Measure the distance to a ball with a smaller one in front at the upper right, which has no symmetry."""
     return np.minimum(sphere(points, 0.3), sphere(points - [0.28, 0.18, 0.22], 0.15))
 
 
@@ -82,7 +82,7 @@ def plain(tmp_path, turntable):
 
 
 def error(vertices, source_from_world):
-    """Mean distance (source units of the fixtures' solids) of vertices brought back to the solid's own frame."""
+    """Measure the mean distance of vertices from the solid, in the frame of the fixtures."""
     m = np.array(source_from_world).reshape(4, 4)
     return np.abs(lopsided(vertices @ m[:3, :3].T + m[:3, 3])).mean()
 
@@ -100,11 +100,9 @@ def reconstructed(gdtool, folder):
 
 def test_wonder3d_is_neither_mirrored_nor_turned(gdtool, wonder3d):
     views, surface, back = reconstructed(gdtool, wonder3d)
-    assert (
-        views.path.name == "views"
-        and views.path.parent.name == "owl.asset"
-        and views.content.domains == ("color", "normal")
-    )
+    assert views.path.name == "views"
+    assert views.path.parent.name == "owl.asset"
+    assert views.content.domains == ("color", "normal")
     assert error(surface.vertices, back) < 0.013  # normals and silhouettes alone; a mirrored one is off by far more
     assert all(error(surface.vertices * flip, back) > 0.02 for flip in ((-1, 1, 1), (1, -1, 1), (1, 1, -1)))
     assert np.ptp(surface.vertices, axis=0).max() == pytest.approx(1, abs=0.04)
@@ -141,9 +139,11 @@ def test_plain_folder_keeps_depth_in_units(gdtool, plain):
 
 def test_up_to_date_dry_run_json_and_changed_picture(gdtool, plain, tmp_path):
     done = gdtool("import-views", plain, "--dry-run")
-    assert done.returncode == 0 and not (tmp_path / "plain.asset").exists()
+    assert done.returncode == 0
+    assert not (tmp_path / "plain.asset").exists()
     done = gdtool("import-views", plain, "--json")
-    assert done.returncode == 0 and json.loads(done.stdout)["folder"].endswith("views")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["folder"].endswith("views")
     assert "up to date" in gdtool("import-views", plain).stderr
     (plain / "000.png").write_bytes((plain / "001.png").read_bytes())
     assert "source changed" in gdtool("import-views", plain).stderr
@@ -163,8 +163,11 @@ def test_bad_input_is_one_line_and_leaves_nothing(gdtool, wonder3d, nerf, plain,
         (tmp_path / "missing", "does not exist"),
     ):
         done = gdtool("import-views", folder, "--quiet")
-        assert done.returncode == 3 and word in done.stderr and done.stdout == "", done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1 and "Traceback" not in done.stderr
+        assert done.returncode == 3, done.stderr
+        assert word in done.stderr, done.stderr
+        assert done.stdout == "", done.stderr
+        assert len(done.stderr.strip().splitlines()) == 1
+        assert "Traceback" not in done.stderr
         assert not (tmp_path / f"{folder.name}.asset" / "views").exists()
     assert gdtool("import-views").returncode == 2
     assert gdtool("import-views", nerf, "--format", "obj").returncode == 2
@@ -173,6 +176,8 @@ def test_bad_input_is_one_line_and_leaves_nothing(gdtool, wonder3d, nerf, plain,
 def test_every_adapter_has_the_interface(tmp_path):
     for name in ADAPTERS:
         module = __import__(f"gdtool.folders.adapters.{name}", fromlist=["read"])
-        assert callable(module.read) and not module.recognises(tmp_path) and module.LOOKS_LIKE
+        assert callable(module.read)
+        assert not module.recognises(tmp_path)
+        assert module.LOOKS_LIKE
     with pytest.raises(Exception, match="transforms.json"):
         adapter(tmp_path)

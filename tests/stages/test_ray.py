@@ -1,4 +1,4 @@
-"""render-dataset on a local Ray cluster of two nodes (make extras-test)."""
+"""Run render-dataset on a local Ray cluster of two nodes (make extras-test)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.filterwarnings("default")
 
 @pytest.fixture(scope="module")
 def address():
-    """Two nodes of one core each."""
+    """Start two nodes of one core each."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     from ray.cluster_utils import Cluster
 
@@ -37,7 +37,9 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
     fast = ("--domains", "normal", "-o", "data", *FAST)
     sources = [f"{name}.obj" for name in "abcdef"]  # relative: meant from here, wherever the workers stand
     done = gdtool_here("render-dataset", *sources, *fast, "--ray", address)
-    assert done.returncode == 1 and "c.obj" in done.stderr and "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == 1, done.stderr
+    assert "c.obj" in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr, done.stderr
     wanted = [f"data/{name}.asset/views" for name in "abdef"]
     assert sorted(done.stdout.splitlines()) == wanted
     assert [one["path"] for one in json.loads((tmp_path / "data/manifest.json").read_text())["content"]["objects"]] == [
@@ -45,7 +47,8 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
     ]
     # The same as without: the folders' digests do not know who made them.
     again = gdtool_here("render-dataset", *sources, *fast)
-    assert again.returncode == 1 and again.stderr.count("up to date") == 5
+    assert again.returncode == 1
+    assert again.stderr.count("up to date") == 5
     assert gdtool_here("render-dataset", "a.obj", *FAST, "--domains", "normal", "-o", "alone").returncode == 0
     alone, there = (
         json.loads((tmp_path / p / "manifest.json").read_text())["files"] for p in ("alone", "data/a.asset/views")
@@ -55,8 +58,10 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
 
 @pytest.fixture
 def where():
-    """The node a text is worked on; "crash" kills its worker, "fault" raises. Local, so that workers need not import
-    this file."""
+    """Return the node that works on a text; "crash" kills its worker, "fault" raises.
+
+    It is a local function, so that workers need not import this file.
+    """
 
     def work(text: str) -> str:
         import os
@@ -77,13 +82,15 @@ def where():
 def test_both_nodes_work_and_a_dead_worker_is_an_error_of_its_source(address, where):
     results = list(cluster.each(address, where, iter(["1", "2", "3", "crash", "4", "fault", "5", "6"]), 1))
     errors = [r for r in results if isinstance(r, GdtoolError)]
-    assert len(results) == 8 and {error.subject for error in errors} == {"crash", "fault"}
-    assert all("\n" not in str(error) for error in errors) and any("no such thing" in str(error) for error in errors)
+    assert len(results) == 8
+    assert {error.subject for error in errors} == {"crash", "fault"}
+    assert all("\n" not in str(error) for error in errors)
+    assert any("no such thing" in str(error) for error in errors)
     assert len({r for r in results if isinstance(r, str)}) == 2
 
 
 def test_few_sources_are_taken_ahead(address, where):
-    """Sources are read as there is room for them, not all at once."""
+    """Sources are read when a core is free, not all at once."""
     taken = []
 
     def texts():
@@ -100,4 +107,5 @@ def test_few_sources_are_taken_ahead(address, where):
 def test_no_cluster_at_the_address(gdtool_here, tmp_path):
     (tmp_path / "a.obj").write_text(BOX)
     done = gdtool_here("render-dataset", "a.obj", *FAST, "--ray", "127.0.0.1:1")
-    assert done.returncode == 5 and "no cluster answers" in done.stderr
+    assert done.returncode == 5
+    assert "no cluster answers" in done.stderr

@@ -1,4 +1,4 @@
-"""gdtool reconstruct by its command line, on views of analytic solids."""
+"""Run gdtool reconstruct on views of analytic solids."""
 
 import json
 
@@ -34,16 +34,15 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     assert done.stdout == f"{out}\n"
     surface = read_surface(open_folder(out))
     content = manifest(out)["content"]
-    assert content["watertight"] and content["light"] and is_closed_manifold(surface.faces)
+    assert content["watertight"]
+    assert content["light"]
+    assert is_closed_manifold(surface.faces)
     skipped = {s["what"]: s["reason"] for s in manifest(out)["skipped"]}
     assert skipped["surface by normals"] == "the views agree"
-    assert (
-        skipped["growth of the surface"] == "no model made the views of a picture" and content["report"]["grown"] == 0
-    )
-    assert (
-        skipped["parts that the picture alone shows"] == "no model made the views of a picture"
-        and content["report"]["restored_share"] == 0
-    )
+    assert skipped["growth of the surface"] == "no model made the views of a picture"
+    assert content["report"]["grown"] == 0
+    assert skipped["parts that the picture alone shows"] == "no model made the views of a picture"
+    assert content["report"]["restored_share"] == 0
     assert np.abs(torus(surface.vertices)).mean() < 0.002
     albedo, roughness, metallic = material(surface.vertices)
     sure = surface.confidence > 0.5
@@ -51,17 +50,17 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     assert np.abs(surface.albedo - albedo)[sure].mean() < 0.02
     assert np.abs(surface.roughness - roughness)[sure].mean() < 0.02
     # Six views around: none sees what the ring hides, none all of it; exact views agree.
-    assert surface.views.min() == 0 and 2 <= surface.views.max() <= 5
-    assert (
-        (surface.views[sure] > 0).all()
-        and surface.residual[surface.views == 0].max() == 0
-        and surface.residual.mean() < 0.02
-    )
+    assert surface.views.min() == 0
+    assert 2 <= surface.views.max() <= 5
+    assert (surface.views[sure] > 0).all()
+    assert surface.residual[surface.views == 0].max() == 0
+    assert surface.residual.mean() < 0.02
     far = sure & (np.abs(surface.vertices[:, 0]) > 0.05)
     assert np.abs(surface.metallic - metallic)[far].mean() < 0.03
     assert gdtool("validate", out).returncode == 0
     again = gdtool("reconstruct", folder)
-    assert again.returncode == 0 and "up to date" in again.stderr
+    assert again.returncode == 0
+    assert "up to date" in again.stderr
 
 
 def test_same_seed_gives_the_same_file(gdtool, folder, tmp_path):
@@ -72,18 +71,20 @@ def test_same_seed_gives_the_same_file(gdtool, folder, tmp_path):
     assert hashes[0] == hashes[1]
 
 
-def test_color_alone_gives_an_honest_hull(gdtool, folder, tmp_path):
+def test_color_alone_gives_the_visual_hull(gdtool, folder, tmp_path):
     out = tmp_path / "color"
     done = gdtool("reconstruct", folder, "--ignore", "normal,depth,albedo,roughness,metallic", "-o", out)
     assert done.returncode == 0, done.stderr
     surface = read_surface(open_folder(out))
     skipped = {s["what"]: s["reason"] for s in manifest(out)["skipped"]}
-    assert "--ignore" in skipped["depth"] and "--ignore" in skipped["albedo"]
+    assert "--ignore" in skipped["depth"]
+    assert "--ignore" in skipped["albedo"]
     assert skipped["surface by normals"] == "there are none"
     assert manifest(out)["content"]["watertight"]
     # The hull holds the object, and is not much larger.
     assert np.abs(torus(surface.vertices)).mean() < 0.03
-    assert surface.albedo.min() >= 0.02 and surface.albedo.max() <= 0.96
+    assert surface.albedo.min() >= 0.02
+    assert surface.albedo.max() <= 0.96
     # Color alone cannot be sure.
     assert surface.confidence.max() <= 0.5
 
@@ -100,21 +101,22 @@ def test_paper_method_writes_its_networks(gdtool, folder, tmp_path):
     assert gdtool("validate", out).returncode == 0
 
 
-def test_paper_method_without_depth_goes_by_what_the_normals_gave(gdtool, folder, tmp_path):
+def test_paper_method_without_depth_uses_depth_from_normals(gdtool, folder, tmp_path):
     out = tmp_path / "paper"
     done = gdtool(
         "reconstruct", folder, "--method", "paper", "--steps", 30, "--resolution", 32, "--ignore", "depth", "-o", out
     )
     assert done.returncode == 0, done.stderr
     skipped = {one["what"]: one["reason"] for one in manifest(out)["skipped"]}
-    assert skipped["volume start"] == "normal views say where the surface is" and "matching of views" not in skipped
+    assert skipped["volume start"] == "normal views say where the surface is"
+    assert "matching of views" not in skipped
     assert manifest(out)["content"]["watertight"]
     assert np.abs(torus(read_surface(open_folder(out)).vertices)).mean() < 0.06
 
 
 @pytest.mark.parametrize("method", ["grid", "paper"])
 def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_path, torus_views, method):
-    """Each view's normals point anywhere: no matched depth is confirmed by another view."""
+    """Normals are random: no matched depth is confirmed by another view."""
     cameras, images, mask = torus_views
     lies = np.random.default_rng(0).standard_normal(images["normal"].shape)
     lies = np.where(mask[..., None] > 0, lies / np.linalg.norm(lies, axis=-1, keepdims=True), 0)
@@ -134,14 +136,18 @@ def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_p
 
 def test_unknown_domain_is_a_usage_error(gdtool, folder):
     done = gdtool("reconstruct", folder, "--ignore", "dept")
-    assert done.returncode == 2 and "dept" in done.stderr and done.stdout == ""
+    assert done.returncode == 2
+    assert "dept" in done.stderr
+    assert done.stdout == ""
 
 
 def test_empty_masks_are_bad_input(gdtool, tmp_path):
     cameras, images, mask = views_of(two_balls, 48, 1)
     empty = views_folder(tmp_path / "nothing.asset" / "views", cameras, images, np.zeros_like(mask))
     done = gdtool("reconstruct", empty)
-    assert done.returncode == 3 and "mask" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 3
+    assert "mask" in done.stderr
+    assert "Traceback" not in done.stderr
     assert not (empty.parent / "surface").exists()
 
 
@@ -151,13 +157,15 @@ def test_one_empty_view_is_left_out_with_a_warning(gdtool, tmp_path):
     mask[4] = 0
     path = views_folder(tmp_path / "two.asset" / "views", cameras, images, mask)
     done = gdtool("reconstruct", path)
-    assert done.returncode == 0 and "left: its mask is empty" in done.stderr
+    assert done.returncode == 0
+    assert "left: its mask is empty" in done.stderr
 
 
 def test_wrong_kind_of_folder_is_bad_input(gdtool, folder):
     assert gdtool("reconstruct", folder).returncode == 0
     done = gdtool("reconstruct", folder.parent / "surface")
-    assert done.returncode == 3 and "views" in done.stderr
+    assert done.returncode == 3
+    assert "views" in done.stderr
 
 
 def test_works_in_a_pipe(gdtool, folder):

@@ -1,4 +1,4 @@
-"""render-dataset by the command line, on meshes made here."""
+"""Run gdtool render-dataset on small generated meshes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def box(tmp_path):
 
 @pytest.fixture
 def gdtool(gdtool_here):
-    """Within this process, but for the tests that ask for the command itself."""
+    """Run commands within this process, except in tests that ask for the command itself."""
     return gdtool_here
 
 
@@ -66,16 +66,20 @@ def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp
     path = tmp_path / "box.asset" / "views"
     assert gdtool("validate", path).returncode == 0
     content = manifest(path)["content"]
-    assert content["conditions"] == 3 and content["light"] and content["environment"].startswith("random:")
+    assert content["conditions"] == 3
+    assert content["light"]
+    assert content["environment"].startswith("random:")
     saved = {s["what"]: s.get("saved_seconds") for s in manifest(path)["skipped"]}
     assert set(saved) >= {"base color lookups", "alpha tests"}
     assert all(saved[what] > 0 for what in ("rays", "normal lookups", "shadow rays of convex objects", "shadow rays"))
-    assert len(read_cameras(path / "condition.json")) == 3 and len(list((path / "condition").glob("*.png"))) == 3
+    assert len(read_cameras(path / "condition.json")) == 3
+    assert len(list((path / "condition").glob("*.png"))) == 3
     views = read_views(open_folder(path))
     assert set(views.images) == {"color", "normal", "depth", "albedo", "roughness", "metallic", "closed_form"}
     # The box, normalised: its front face spans 1/3 x 1 and lies 1/3 in front of the centre.
     matrix = np.array(content["source_from_world"]).reshape(4, 4)
-    assert matrix[0, 0] == pytest.approx(1.2) and np.allclose(matrix[:3, 3], (3.2, 1.6, 2.4))
+    assert matrix[0, 0] == pytest.approx(1.2)
+    assert np.allclose(matrix[:3, 3], (3.2, 1.6, 2.4))
     front = views.mask[0].sum() * views.cameras[0].pixel_size ** 2
     assert front == pytest.approx(1 / 3, rel=0.1)
     assert np.allclose(views.images["normal"][0, 16, 16], (0, 0, 1), atol=1e-4)
@@ -84,8 +88,8 @@ def test_writes_a_folder_that_validates_with_all_it_should_hold(gdtool, box, tmp
     assert (views.images["color"][views.mask > 0] > 0).any()
 
 
-def test_turned_objects_look_as_they_do_from_beside(gdtool, box, tmp_path):
-    """The frame says how far each was turned; their smooth normals turn with them."""
+def test_turned_objects_look_as_from_a_turned_camera(gdtool, box, tmp_path):
+    """source_from_world records each turn, and smooth normals turn with the object."""
     ball = trimesh.creation.icosphere(2)
     ball.apply_scale((1.0, 1.5, 0.5))
     ball.vertex_normals  # noqa: B018 - written with the file
@@ -145,7 +149,8 @@ def test_turned_objects_look_as_they_do_from_beside(gdtool, box, tmp_path):
 def test_second_run_is_up_to_date_and_same_seed_means_same_files(gdtool, box, tmp_path):
     assert gdtool("render-dataset", box, *FAST).returncode == 0
     again = gdtool("render-dataset", box, *FAST)
-    assert again.returncode == 0 and "up to date" in again.stderr
+    assert again.returncode == 0
+    assert "up to date" in again.stderr
     assert gdtool("render-dataset", box, *FAST, "-o", "other").returncode == 0
     files = {p.relative_to(tmp_path / "other") for p in (tmp_path / "other").rglob("*") if p.is_file()} - {
         *map(type(box), ["manifest.json"])
@@ -161,8 +166,11 @@ def test_bad_inputs_exit_3_with_one_line(gdtool, tmp_path):
     (tmp_path / "text.glb").write_text("not a model")
     for name in ("empty.obj", "text.glb", "missing.glb"):
         done = gdtool("render-dataset", name, *FAST)
-        assert done.returncode == 3 and name.split(".")[0] in done.stderr and "Traceback" not in done.stderr
-        assert done.stdout == "" and not (tmp_path / name.replace(name[-4:], ".asset") / "views").exists()
+        assert done.returncode == 3
+        assert name.split(".")[0] in done.stderr
+        assert "Traceback" not in done.stderr
+        assert done.stdout == ""
+        assert not (tmp_path / name.replace(name[-4:], ".asset") / "views").exists()
 
 
 def test_pipes_stream_and_one_bad_source_among_many(gdtool, box, tmp_path):
@@ -173,7 +181,8 @@ def test_pipes_stream_and_one_bad_source_among_many(gdtool, box, tmp_path):
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 1 and "missing.obj" in done.stderr
+    assert done.returncode == 1
+    assert "missing.obj" in done.stderr
     assert done.stdout.splitlines() == ["data/box.asset/views", "data/procedural-000003.asset/views"]
     assert manifest(tmp_path / "data/procedural-000003.asset/views")["content"]["model"]
     assert (tmp_path / "data/procedural-000003.asset/views/source.glb").is_file()
@@ -204,7 +213,8 @@ def test_cameras_of_other_views_are_used_with_their_frame(gdtool, box, tmp_path)
         == 0
     )
     first, same, copied = (read_views(open_folder(tmp_path / p)) for p in ("box.asset/views", "again", "copied"))
-    assert [c.name for c in same.cameras] == ["000", "001", "002"] and same.cameras[0].projection == "perspective"
+    assert [c.name for c in same.cameras] == ["000", "001", "002"]
+    assert same.cameras[0].projection == "perspective"
     for domain in first.images:
         assert np.array_equal(first.images[domain], same.images[domain]), domain
     assert copied.mask.sum() == pytest.approx(first.mask.sum() * 0.95**2, rel=0.05)
@@ -213,9 +223,12 @@ def test_cameras_of_other_views_are_used_with_their_frame(gdtool, box, tmp_path)
 def test_named_lights_rigs_and_filter(gdtool, box, tmp_path):
     assert gdtool("render-dataset", box, *FAST, "--light", "bright", "--rig", "sphere", "--views", "2").returncode == 0
     content = manifest(tmp_path / "box.asset/views")["content"]
-    assert content["environment"] == "bright" and len(content["views"]) == 2
+    assert content["environment"] == "bright"
+    assert len(content["views"]) == 2
     dropped = gdtool("render-dataset", box, *FAST, "--filter", "complete-pbr", "-o", "kept")
-    assert dropped.returncode == 3 and "complete" in dropped.stderr and not (tmp_path / "kept").exists()
+    assert dropped.returncode == 3
+    assert "complete" in dropped.stderr
+    assert not (tmp_path / "kept").exists()
     assert gdtool("render-dataset", box, *FAST, "--domains", "colour").returncode == 2
     assert gdtool("render-dataset", box, *FAST, "--light", "none.hdr").returncode == 3
 
@@ -227,10 +240,12 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
     fast = (*FAST, "--domains", "normal", "-o", "data")
     first = gdtool("render-dataset", *sources, *fast, "--shard", "1/2")
     # Bad files are reported and the rest goes on.
-    assert first.returncode == 1 and "c.obj" in first.stderr
+    assert first.returncode == 1
+    assert "c.obj" in first.stderr
     assert first.stdout.splitlines() == ["data/a.asset/views", "data/e.asset/views"]
     second = gdtool("render-dataset", *sources, *fast, "--shard", "2/2")
-    assert second.returncode == 0 and second.stdout.splitlines() == ["data/b.asset/views", "data/d.asset/views"]
+    assert second.returncode == 0
+    assert second.stdout.splitlines() == ["data/b.asset/views", "data/d.asset/views"]
     listed = [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]]
     assert listed == [f"{name}.asset/views" for name in "abde"]
     for wrong in ("0/2", "3/2", "2", "a/b"):
@@ -238,7 +253,7 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
 
 
 def test_goes_on_after_a_kill(gdtool, box, tmp_path):
-    """Killed while it works on the second of three: the first is kept, nothing half-written is left or listed."""
+    """Killed while it renders the second of three: the first is kept, no half-written folder is left or listed."""
     for name in "abc":
         (tmp_path / f"{name}.obj").write_text(BOX)
     arguments = (*(tmp_path / f"{name}.obj" for name in "abc"), *FAST, "--domains", "normal", "-o", "data")
@@ -249,7 +264,8 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
     process.stdout.close()
     before = (tmp_path / "data/a.asset/views/manifest.json").read_bytes()
     again = gdtool("render-dataset", *arguments)
-    assert again.returncode == 0 and "a.asset/views: up to date" in again.stderr, again.stderr
+    assert again.returncode == 0, again.stderr
+    assert "a.asset/views: up to date" in again.stderr, again.stderr
     assert (tmp_path / "data/a.asset/views/manifest.json").read_bytes() == before
     assert [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]] == [
         f"{name}.asset/views" for name in "abc"
@@ -260,8 +276,7 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
-    """Resident memory after twelve rounds over five objects is that after four: what a run took is given back, or used
-    again."""
+    """Resident memory after twelve rounds over five objects is that after four."""
     from gdtool.core import log
     from gdtool.core.runner import Settings, run_all
     from gdtool.stages.render_dataset import STAGE, Options
@@ -289,7 +304,7 @@ def test_memory_does_not_grow_with_the_number_of_objects(monkeypatch):
 
 
 def test_either_reflection_model(gdtool, box, tmp_path):
-    """closed_form and color follow --brdf; what is not lit does not."""
+    """closed_form and color follow --brdf; unlit images do not."""
     views = {}
     for brdf in ("gltf", "paper"):
         assert (
@@ -314,10 +329,13 @@ def test_either_reflection_model(gdtool, box, tmp_path):
     assert np.array_equal(one["normal"], two["normal"])
     for domain in ("color", "closed_form"):
         difference = np.abs(one[domain] - two[domain])[views["gltf"].mask > 0]
-        assert difference.max() > 1e-3 and difference.mean() < 0.1, domain
+        assert difference.max() > 1e-3, domain
+        assert difference.mean() < 0.1, domain
 
 
 def test_without_ray_or_its_cluster_that_is_said(gdtool, box, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     done = gdtool("render-dataset", box, *FAST, "--ray", "local")
-    assert done.returncode == 5 and "gdtool[ray]" in done.stderr and done.stdout == ""
+    assert done.returncode == 5
+    assert "gdtool[ray]" in done.stderr
+    assert done.stdout == ""

@@ -1,4 +1,4 @@
-"""gdtool train on three painted spheres."""
+"""Run gdtool train on three painted spheres."""
 
 import csv
 import json
@@ -30,21 +30,25 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
     assert first.stdout == "model\n"
     model = tmp_path / "model"
     manifest = json.loads((model / "manifest.json").read_text())
-    assert (
-        manifest["kind"] == "model"
-        and manifest["content"]["steps"] == 4
-        and manifest["content"]["report"]["objects"] == 2
-    )
+    assert manifest["kind"] == "model"
+    assert manifest["content"]["steps"] == 4
+    assert manifest["content"]["report"]["objects"] == 2
     rows = list(csv.DictReader((model / "loss.csv").read_text().splitlines()))
-    assert [int(row["step"]) for row in rows] == [1, 2, 3, 4] and all(float(row["loss"]) > 0 for row in rows)
+    assert [int(row["step"]) for row in rows] == [1, 2, 3, 4]
+    assert all(float(row["loss"]) > 0 for row in rows)
     assert (model / "validation" / "step_000004.png").stat().st_size > 1000
     told = list(csv.DictReader((model / "validation.csv").read_text().splitlines()))
-    assert [row["step"] for row in told] == ["4"] and 0 < float(told[0]["color"]) < 60 and float(told[0]["seconds"]) > 0
-    assert (model / "loss.png").is_file() and "spheres" not in (model / "card.md").read_text()
-    assert not list(model.glob("**/*.pt")) and load_file(model / "model.safetensors")
+    assert [row["step"] for row in told] == ["4"]
+    assert 0 < float(told[0]["color"]) < 60
+    assert float(told[0]["seconds"]) > 0
+    assert (model / "loss.png").is_file()
+    assert "spheres" not in (model / "card.md").read_text()
+    assert not list(model.glob("**/*.pt"))
+    assert load_file(model / "model.safetensors")
     assert gdtool("validate", model).returncode == 0
     second = gdtool("train", spheres, *TINY, "--steps", 4, "--held-out", 1, "-o", "model")
-    assert second.stdout == "model\n" and "up to date" in second.stderr
+    assert second.stdout == "model\n"
+    assert "up to date" in second.stderr
 
 
 def test_tensorboard_has_every_row_of_the_log(gdtool, spheres, tmp_path):
@@ -65,9 +69,9 @@ def test_without_the_package_tensorboard_is_refused(gdtool, spheres, tmp_path, m
     (tmp_path / "hidden/tensorboard/__init__.py").write_text("raise ImportError('hidden')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "hidden"))
     run = gdtool("train", spheres, *TINY, "--steps", 2, "--tensorboard", "-o", "model")
-    assert (
-        run.returncode == 5 and "pip install 'gdtool[tensorboard]'" in run.stderr and not (tmp_path / "model").exists()
-    )
+    assert run.returncode == 5
+    assert "pip install 'gdtool[tensorboard]'" in run.stderr
+    assert not (tmp_path / "model").exists()
 
 
 def test_same_seed_same_weights(gdtool, spheres, tmp_path):
@@ -87,7 +91,8 @@ def test_a_killed_training_goes_on_where_it_was(gdtool, spheres, tmp_path):
     )
     deadline = time.monotonic() + 240  # the machine may be busy
     while not list(tmp_path.glob(".*/checkpoint.safetensors")) + list(tmp_path.glob("*/checkpoint.safetensors")):
-        assert process.poll() is None and time.monotonic() < deadline, "no checkpoint was written"
+        assert process.poll() is None, "no checkpoint was written"
+        assert time.monotonic() < deadline, "no checkpoint was written"
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -125,7 +130,9 @@ def test_training_goes_on_from_a_model(gdtool, spheres, tmp_path):
 def test_a_wrong_configuration_is_named(gdtool, spheres, tmp_path, changes, words):
     (tmp_path / "config.json").write_text(json.dumps(changes))
     result = gdtool("train", spheres, *TINY, "-o", "model")
-    assert result.returncode == 3 and words in result.stderr and "Traceback" not in result.stderr
+    assert result.returncode == 3
+    assert words in result.stderr
+    assert "Traceback" not in result.stderr
     assert not (tmp_path / "model").exists()
 
 
@@ -134,7 +141,8 @@ def test_data_without_the_domains_are_refused(gdtool, tmp_path):
     write_spheres(tmp_path / "colors", count=2, size=16, domains=("color", "normal"))
     result = gdtool("train", "colors", *TINY, "-o", "model")
     assert result.returncode == 3
-    assert "albedo" in result.stderr and "render-dataset" in result.stderr
+    assert "albedo" in result.stderr
+    assert "render-dataset" in result.stderr
 
 
 def test_a_start_of_another_shape_is_refused(gdtool, spheres, tmp_path):
@@ -144,7 +152,8 @@ def test_a_start_of_another_shape_is_refused(gdtool, spheres, tmp_path):
     weights["unet.conv_in.weight"] = weights["unet.conv_in.weight"][:4]
     save_file(weights, tmp_path / "first/model.safetensors")
     result = gdtool("train", spheres, *TINY, "--steps", 1, "--start", "first", "-o", "second")
-    assert result.returncode == 3 and "first" in result.stderr
+    assert result.returncode == 3
+    assert "first" in result.stderr
 
 
 def test_a_small_model_is_grown_to_a_larger_size(gdtool, spheres, tmp_path):
@@ -159,4 +168,5 @@ def test_a_small_model_is_grown_to_a_larger_size(gdtool, spheres, tmp_path):
     # One small step away.
     assert np.abs(pixels[:, :, 0::2] - pixels[:, :, 1::2]).max() < 0.01 * np.abs(pixels).max() + 0.01
     bad = gdtool("train", large, *TINY, "--size", 24, "--steps", 1, "-o", "bad")
-    assert bad.returncode == 3 and "neither a multiple" in bad.stderr
+    assert bad.returncode == 3
+    assert "neither a multiple" in bad.stderr

@@ -1,4 +1,4 @@
-"""gdtool unwrap: a valid atlas of whole quads, up to date the second time, own texture coordinates kept."""
+"""Run gdtool unwrap: a valid atlas of whole quads, up to date the second time, valid texture coordinates kept."""
 
 import json
 from pathlib import Path
@@ -29,10 +29,17 @@ def test_atlas_of_quads(gdtool, tmp_path, ring):
     assert run.stdout == "ring.asset/atlas\n"
     folder = open_folder(tmp_path / "ring.asset/atlas")
     mesh = read_mesh(folder)
-    assert len(mesh.faces) == len(ring[1]) and mesh.is_quad.all() and mesh.uv is not None
+    assert len(mesh.faces) == len(ring[1])
+    assert mesh.is_quad.all()
+    assert mesh.uv is not None
     found = folder.content
-    assert found.padding == 4 and found.quads == 512 and found.watertight and found.charts == found.report["charts"]
-    assert found.report["overlap"] == 0 and found.report["mirrored"] == 0 and found.coverage > 0.3
+    assert found.padding == 4
+    assert found.quads == 512
+    assert found.watertight
+    assert found.charts == found.report["charts"]
+    assert found.report["overlap"] == 0
+    assert found.report["mirrored"] == 0
+    assert found.coverage > 0.3
     for picture in ("layout.png", "checkerboard.png"):
         assert folder.file(picture).stat().st_size > 1000
     assert "up to date" in gdtool("unwrap", "ring.obj", "--size", 512, "--mip-safe", 128).stderr
@@ -57,7 +64,8 @@ def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
     quad = np.array([[0, 1, 2, 3]], np.int32)
     write_obj(tmp_path / "leaf.obj", QuadMesh(vertices, quad, uv, quad))
     run = gdtool("unwrap", "leaf.obj")
-    assert run.returncode == 0 and "100% of the surface is mirrored" in run.stderr
+    assert run.returncode == 0
+    assert "100% of the surface is mirrored" in run.stderr
     assert content(tmp_path / "leaf.asset/atlas")["report"]["mirrored"] == 1
     assert "mirrored" not in gdtool("unwrap", "leaf.obj", "--redo").stderr
 
@@ -66,7 +74,9 @@ def test_a_short_time_is_kept_and_told(gdtool, tmp_path, ring):
     run = gdtool("unwrap", "ring.obj", "--size", 512, "--seconds", 0.01)
     assert run.returncode == 0, run.stderr
     found = content(tmp_path / "ring.asset/atlas")
-    assert found["tried"] and found["report"]["overlap"] == 0 and found["report"]["mirrored"] == 0
+    assert found["tried"]
+    assert found["report"]["overlap"] == 0
+    assert found["report"]["mirrored"] == 0
 
 
 def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
@@ -75,7 +85,8 @@ def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])
     write_obj(tmp_path / "twice.obj", QuadMesh(vertices, faces, uv, np.array([[0, 1, 2, 3], [0, 1, 2, 3]], np.int32)))
     run = gdtool("unwrap", "twice.obj")
-    assert run.returncode == 0 and "overlap" in run.stderr
+    assert run.returncode == 0
+    assert "overlap" in run.stderr
     assert content(tmp_path / "twice.asset/atlas")["report"]["overlap"] == 0
 
 
@@ -90,14 +101,18 @@ def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
 def test_bad_mesh_is_refused(gdtool, tmp_path, text, fact):
     (tmp_path / "bad.obj").write_text(text)
     run = gdtool("unwrap", "bad.obj")
-    assert run.returncode == 3 and fact in run.stderr and "Traceback" not in run.stderr
+    assert run.returncode == 3
+    assert fact in run.stderr
+    assert "Traceback" not in run.stderr
 
 
 def test_wrong_kind_names_the_stage_that_makes_the_right_one(gdtool, tmp_path):
     (tmp_path / "leaf.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3\n")
     assert gdtool("unwrap", "leaf.obj").returncode == 0
     run = gdtool("unwrap", "leaf.asset/atlas")
-    assert run.returncode == 3 and "holds atlas" in run.stderr and "gdtool remesh" in run.stderr
+    assert run.returncode == 3
+    assert "holds atlas" in run.stderr
+    assert "gdtool remesh" in run.stderr
 
 
 def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
@@ -105,7 +120,9 @@ def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
     assert run.returncode == 0, run.stderr
     folder = open_folder(tmp_path / "ring.asset/atlas")
     report, mesh = folder.content.report, read_mesh(folder)
-    assert report["shared"] == 0.5 and report["overlap"] == 0 and report["mirrored"] == 0
+    assert report["shared"] == 0.5
+    assert report["overlap"] == 0
+    assert report["mirrored"] == 0
 
     # Each vertex' corners lie where those of its mirror image do.
     def corners_of(vertices):
@@ -119,5 +136,6 @@ def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
     lopsided = ring[0] + (0.1 * ring[0][:, 1:2] ** 2 + 0.05 * ring[0][:, :1] ** 2) * (1, 0, 0)
     write_obj(tmp_path / "bent.obj", QuadMesh(lopsided, ring[1].astype(np.int32)))
     run = gdtool("unwrap", "bent.obj", "--size", 256, "--symmetry", "x")
-    assert run.returncode == 0 and "no face mirrors another along x" in run.stderr
+    assert run.returncode == 0
+    assert "no face mirrors another along x" in run.stderr
     assert content(tmp_path / "bent.asset/atlas")["report"]["shared"] == 0

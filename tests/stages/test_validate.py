@@ -1,4 +1,4 @@
-"""gdtool validate: what is right, what is wrong, and what cannot be told here."""
+"""Run gdtool validate on valid folders, on faulty ones, and where it cannot check."""
 
 import base64
 import json
@@ -26,7 +26,7 @@ def good(tmp_path_factory):
 
 
 def large(path):
-    """A glTF triangle with a texture of more pixels a side than gdtool opens."""
+    """Write a glTF triangle with a texture of more pixels a side than gdtool opens."""
     Image.new("RGB", (16_400, 1)).save(path.with_suffix(".png"))
     points = struct.pack("<9f", 1, 0, 0, 0, 1, 0, 0, 0, 1)
     material = {"pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
@@ -59,7 +59,7 @@ def large(path):
     return path
 
 
-def test_a_right_folder_is_said_to_be(gdtool, good):
+def test_a_valid_folder_is_reported_as_valid(gdtool, good):
     done = gdtool("validate", good)
     assert (done.returncode, done.stdout) == (0, f"valid: {good}\n")
 
@@ -69,12 +69,17 @@ def test_each_source_is_checked_and_the_first_faults_are_named(gdtool, good, tmp
     (bad / "mask" / "front.png").write_bytes(b"no picture")
     done = gdtool("validate", "--json", bad, good)
     first, second = (json.loads(line) for line in done.stdout.splitlines())
-    assert done.returncode == 3 and not first["valid"] and "mask/front.png" in first["faults"][0] and second["valid"]
+    assert done.returncode == 3
+    assert not first["valid"]
+    assert "mask/front.png" in first["faults"][0]
+    assert second["valid"]
 
 
-def test_what_cannot_be_read_here_is_not_called_faulty(gdtool, good, tmp_path):
+def test_a_missing_resource_is_an_error_and_not_a_fault(gdtool, good, tmp_path):
     done = gdtool("validate", large(tmp_path / "x.gltf"), good)
-    assert done.returncode == 5 and "x.png" in done.stderr and "16400" in done.stderr
+    assert done.returncode == 5
+    assert "x.png" in done.stderr
+    assert "16400" in done.stderr
     assert done.stdout == f"valid: {good}\n"
 
 
@@ -84,17 +89,18 @@ def result(tmp_path):
     return done.path
 
 
-def test_options_that_are_not_what_the_key_was_made_of(tmp_path):
+def test_options_that_do_not_match_the_key_are_a_fault(tmp_path):
     folder = result(tmp_path)
     assert list(validate.faults(folder)) == []
     record = json.loads((folder / "manifest.json").read_text())
     record["options"]["faces"] = 5000
     (folder / "manifest.json").write_text(json.dumps(record))
     (fault,) = validate.faults(folder)
-    assert "not those that the key was made of" in fault and "gdtool remesh" in fault
+    assert "not those that the key was made of" in fault
+    assert "gdtool remesh" in fault
 
 
-def test_inputs_that_are_not_what_the_key_was_made_of(tmp_path):
+def test_inputs_that_do_not_match_the_key_are_a_fault(tmp_path):
     folder = result(tmp_path)
     record = json.loads((folder / "manifest.json").read_text())
     record["inputs"][0]["digest"] = "0" * 64
@@ -102,8 +108,8 @@ def test_inputs_that_are_not_what_the_key_was_made_of(tmp_path):
     assert "not those that the key was made of" in list(validate.faults(folder))[0]
 
 
-def test_a_key_of_which_a_file_is_a_part(tmp_path):
-    """An option that names a file enters the key by digest; once the file is gone that cannot be checked."""
+def test_a_key_follows_the_content_of_a_file_option(tmp_path):
+    """The digest of the file is part of the key; without the file the key cannot be checked."""
     write_exr(tmp_path / "sky.exr", np.ones((8, 16, 3), np.float32))
     options = relight.Options(env="sky.exr", views=1, size=16, samples=1, light_samples=1)
     triangles = np.concatenate([QUADS[:, [0, 1, 2]], QUADS[:, [0, 2, 3]]]).astype(np.int32)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gdtool.core.errors import UsageError
 from gdtool.core.stage import Output
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.data.objects import to_tensor_condition
@@ -14,6 +15,19 @@ from gdtool.diffusion.inference.compiled import sample_compiled
 from gdtool.diffusion.inference.familiarity import doubts, read_ranges, unfamiliar
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.model import Model
+
+
+def choose_domains(asked: tuple[str, ...] | None, config: ModelConfig) -> tuple[str, ...]:
+    """Return the domains to write: those asked for, or (None) all that the model has. Raises UsageError for others."""
+    domains = config.domains if asked is None else asked
+    unknown = [d for d in domains if d not in config.domains]
+    if unknown or not domains:
+        raise UsageError(
+            "--domains",
+            f"{unknown[0] if unknown else 'nothing'} is not a domain of this model",
+            f"choose from {','.join(config.domains)}",
+        )
+    return domains
 
 
 def sample_condition(
@@ -72,3 +86,16 @@ def tell_doubts(
             f"{name}: the model is unsure of the views that the picture does not show ({'; '.join(unsure)}): "
             "look at contact_sheet.png before going on, and try a picture straight from the front, or another --model"
         )
+
+
+def tell_unused_picture(report: dict[str, float], domains: tuple[str, ...], has_front: bool, out: Output) -> None:
+    """Record what of the picture itself the views did not take over, and why.
+
+    has_front: a view is the one that the picture was taken from.
+    """
+    if not report["drawn_share"]:
+        reason = "each has room for all of them" if has_front else "no view is the picture's own"
+        out.skip("parts of the picture in the other views", reason)
+    if not report["painted_share"] and "albedo" in domains:
+        reason = "its detail is light, or metal, by the model's albedo" if has_front else "no view is the picture's own"
+        out.skip("paint of the picture", reason)

@@ -1,7 +1,8 @@
-"""Readers of other programs' pictures: each turns a folder into cameras and images in gdtool's conventions.
+"""Read other programs' pictures: each adapter turns a folder into cameras and images in gdtool's conventions.
 
-An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`; ADAPTERS lists them in the
-order in which they are asked. Add a module and its name, and `gdtool import-views` reads one format more."""
+An adapter is a module with `recognises(folder) -> bool` and `read(folder) -> Pictures`. ADAPTERS lists them in the
+order in which they are asked. For another format, add a module and its name.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +17,15 @@ from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
 
 ADAPTERS = ("wonder3d", "nerf", "plain")
+MIN_COVERAGE = 1 / 512  # of a pixel: half a step of 8-bit storage; what is below counts as background
 
 
 @dataclass(frozen=True)
 class Pictures:
-    """What an adapter read: one image size, any subset of the domains.
+    """Hold what an adapter read: images of one size, in any subset of the domains.
 
-    images: domain to (k, h, w, 3) or (k, h, w) float32 as folders.views.Views holds them (linear colors, normals in
-    world axes, depth along the axis); mask (k, h, w). up: the world axis that points up, "y" or "z".
+    images: domain to (k, h, w, 3) or (k, h, w) float32 as in folders.views.Views (linear colors, normals in world axes,
+    depth along the axis). mask (k, h, w). up: the world axis that points up, "y" or "z".
     """
 
     cameras: list[Camera]
@@ -33,7 +35,7 @@ class Pictures:
 
 
 def adapter(folder: Path, name: str = "auto") -> ModuleType:
-    """Return the adapter of that name, or the first that recognises the folder. Raises InputError."""
+    """Return the adapter of a name, or the first one that recognises the folder. Raises InputError."""
     for known in ADAPTERS if name == "auto" else (name,):
         module = import_module(f"{__name__}.{known}")
         if module.recognises(folder):
@@ -47,7 +49,10 @@ def adapter(folder: Path, name: str = "auto") -> ModuleType:
 
 
 def linear_color(image: np.ndarray) -> np.ndarray:
-    """(h, w, 3) linear float32 of a picture as read_image gives it: integers are sRGB, floats linear."""
+    """Convert a picture as read_image returns it to linear color (h, w, 3), float32.
+
+    Integers are sRGB, floats linear.
+    """
     from gdtool.images.color import linear_from_srgb, unit_range
 
     image = np.repeat(image, 3, -1)[..., :3] if image.shape[-1] < 3 else image[..., :3]
@@ -55,7 +60,7 @@ def linear_color(image: np.ndarray) -> np.ndarray:
 
 
 def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
-    """Images of one size as one array. Raises InputError naming the first of another size."""
+    """Stack images of one size. Raises InputError naming the first of another size."""
     for part, path in zip(parts, paths, strict=True):
         if part.shape != parts[0].shape:
             raise InputError(
@@ -64,3 +69,36 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
                 "scale all views to one size",
             )
     return np.stack(parts)
+
+
+def without_traces(mask: np.ndarray) -> np.ndarray:
+    """Set coverage (k, h, w) below half a step of 8-bit storage to 0."""
+    return np.where(mask > MIN_COVERAGE, mask, 0).astype(np.float32)
+
+
+def upright(up: str) -> np.ndarray:
+    """Return the rotation (4, 4) that takes a world with the given axis up, "y" or "z", to one with y up."""
+    out = np.eye(4)
+    if up == "z":
+        out[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    return out
+
+
+def transform_images(images: dict[str, np.ndarray], matrix: np.ndarray) -> dict[str, np.ndarray]:
+    """Apply a similarity (4, 4) of the world to the images by domain: it turns normals and scales depth."""
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    out = dict(images)
+    if "normal" in out:
+        out["normal"] = (out["normal"] @ (matrix[:3, :3] / scale).T).astype(np.float32)
+    if "depth" in out:
+        out["depth"] = (out["depth"] * scale).astype(np.float32)
+    return out
+
+
+def clear_background(images: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Set the images by domain (k, h, w[, 3]) to 0 where the mask (k, h, w) is 0."""
+    inside = mask > 0
+    return {
+        name: np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
+        for name, stack in images.items()
+    }

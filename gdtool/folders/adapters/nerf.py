@@ -1,4 +1,4 @@
-"""NeRF's transforms.json: perspective cameras with OpenGL axes in a world with Z up, and one color picture each."""
+"""Read NeRF's transforms.json: perspective cameras with OpenGL axes in a world with Z up, each with a color picture."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _FILES = ("transforms.json", "transforms_train.json")
 
 
 def recognises(folder: Path) -> bool:
-    """Return whether a folder looks like one of this program."""
+    """Tell whether a folder has a transforms.json."""
     return any((folder / name).is_file() for name in _FILES)
 
 
 def read(folder: Path) -> Pictures:
-    """All frames of the file. The mask is the picture's alpha, or its difference from a plain background."""
+    """Read all frames. The mask is the picture's alpha, or its difference from a plain background."""
     from gdtool.images.io import read_image
     from gdtool.images.mask import foreground
 
@@ -66,7 +66,7 @@ def read(folder: Path) -> Pictures:
 
 
 def _picture(path: Path, name: str) -> Path:
-    """Return the picture that a file_path names, within the folder of transforms.json. Raises InputError."""
+    """Return the path of the picture that a file_path names, within the folder. Raises InputError."""
     for suffix in _SUFFIXES:
         found = uri_path(path.parent, name + suffix, path, "file_path")
         if is_readable(found):
@@ -75,7 +75,7 @@ def _picture(path: Path, name: str) -> Path:
 
 
 def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: int) -> Camera:
-    """One frame's camera; intrinsics for another size than the picture's are scaled to it."""
+    """Make the camera of a frame; intrinsics for another size than the picture's are scaled."""
 
     def value(key: str, default: float | None = None, least: float = -_MOST_PIXELS) -> float:
         found = record.get(key, default)
@@ -128,7 +128,7 @@ def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: i
 
 
 def _matrix(rows: Any) -> np.ndarray | None:
-    """(3 or 4, 4) float64 of nested lists; None for anything else than so many numbers of at most _MOST_PIXELS."""
+    """Convert nested lists to (3 or 4, 4) float64; None for another shape or numbers beyond _MOST_PIXELS."""
     if (
         not isinstance(rows, list)
         or len(rows) not in (3, 4)

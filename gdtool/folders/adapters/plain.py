@@ -1,8 +1,8 @@
-"""A plain folder: cameras.json in gdtool's own form, and pictures as <domain>/<view>.<suffix> or, colors,
-<view>.<suffix>.
+"""Read a plain folder: gdtool's own cameras.json, and pictures as <domain>/<view>.<suffix>.
 
-What schemas/views.md says of encodings holds, except that any readable image format will do and that a view without a
-mask/<view> is masked by its color's alpha, else by its difference from a plain background.
+The color pictures may also be <view>.<suffix>. Encodings are those of schemas/views.md, but any readable image format
+is accepted. A view without a mask/<view> is masked by its color's alpha, else by its difference from a plain
+background.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _SUFFIXES = (".png", ".exr", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 
 def recognises(folder: Path) -> bool:
-    """Return whether a folder looks like one of this program."""
+    """Tell whether a folder has a cameras.json."""
     return (folder / "cameras.json").is_file()
 
 
 def read(folder: Path) -> Pictures:
-    """Every domain that all views have."""
+    """Read every domain that all views have."""
     from gdtool.images.color import decode_normal, unit_range
     from gdtool.images.io import read_image
     from gdtool.images.mask import foreground
@@ -91,6 +91,7 @@ def read(folder: Path) -> Pictures:
 
 
 def _find(folder: Path, domain: str, view: str) -> Path | None:
+    """Find the picture of a view in a domain; None where there is none."""
     places = [f"{domain}/"] + ([""] if domain == "color" else [])
     for place in places:
         for suffix in _SUFFIXES:
@@ -101,6 +102,7 @@ def _find(folder: Path, domain: str, view: str) -> Path | None:
 
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
+    """Return the height and width of a picture. Raises InputError where its camera has others."""
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             path,

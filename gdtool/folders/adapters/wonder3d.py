@@ -1,9 +1,9 @@
-"""Wonder3D's output of one object: normals_000_<view>.png and rgb_000_<view>.png of six views.
+"""Read Wonder3D's output of one object: normals_000_<view>.png and rgb_000_<view>.png of six views.
 
-Its conventions: orthographic, 1.35 world units across; normals of all views in the front camera's OpenGL axes, stored
-0.5 n + 0.5, the mask in their alpha; its world has Z up and the front camera at (0, -r, 0). The front camera's axes are
-gdtool's world axes, so normals need no turn: its world (x, y, z) is (x, z, -y) here, never (x, z, y), which mirrors.
-Source: instant-nsr-pl/datasets/ortho.py of Wonder3D (Long et al. 2023).
+Its cameras are orthographic, 1.35 world units across. Normals of all views are in the front camera's OpenGL axes,
+stored as 0.5 n + 0.5, with the mask in their alpha. Its world has Z up and the front camera at (0, -r, 0). The front
+camera's axes are gdtool's world axes, so normals are not turned: its world (x, y, z) is (x, z, -y) here, never (x, z,
+y), which mirrors. Source: instant-nsr-pl/datasets/ortho.py of Wonder3D (Long et al. 2023).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ LOOKS_LIKE = "normals_000_front.png and the like"
 
 
 def recognises(folder: Path) -> bool:
-    """Return whether a folder looks like one of this program."""
+    """Tell whether a folder has the files of Wonder3D."""
     return (folder / "normals_000_front.png").is_file()
 
 
 def read(folder: Path) -> Pictures:
-    """All six views; colors where every view has one."""
+    """Read the six views, with colors where every view has one."""
     from gdtool.images.color import decode_normal, unit_range
     from gdtool.images.io import read_image
 

@@ -1,41 +1,48 @@
-"""Prepare objects for ground-truth views: accept or refuse, place and turn them, and choose their light."""
+"""Render objects for ground-truth views: accept or refuse them, choose their light, and render views and conditions."""
 
 from __future__ import annotations
 
-import dataclasses
-import hashlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gdtool.assets.scene import Scene
 from gdtool.cameras import Camera
-from gdtool.core import sources
 from gdtool.core.errors import InputError
-from gdtool.core.folder import Folder, is_folder, open_folder
-from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
+from gdtool.core.folder import Folder
+from gdtool.core.kinds import DOMAINS, ViewsContent
+from gdtool.geometry.enclosed_bodies import enclosed_bodies_warning
 from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
+from gdtool.images.color import srgb_from_linear
 from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.lights.bundled import BUNDLED
 from gdtool.shading.lights.environment import Environment
 from gdtool.shading.lights.studio import studio
 from gdtool.shading.render.direct import DirectLight
+from gdtool.shading.render.placement import seed_of
 from gdtool.shading.render.render import Renderer
+from gdtool.shading.render.rigs import condition_camera
 
 # The least share of its area on which an object must have textures to count as complete.
 MIN_COMPLETE_AREA = 0.95
-# A bounding box is about normalised when its centre and its longest side are off by less than this.
-ABOUT_NORMALISED = 0.1
 # Random lights are numbered below this.
 RANDOM_LIGHTS = 10**9
 
 
-def seed_of(name: str) -> int:
-    """Hash a name to a 64-bit number that is the same on every machine."""
-    return int.from_bytes(hashlib.sha256(name.encode(errors="surrogateescape")).digest()[:8], "big")
+def examine(scene: Scene, name: str, generated: bool, complete: bool) -> Iterator[str]:
+    """Yield a warning for each oddity of a model: what its reader ignored, and parts inside of others.
+
+    complete: raise InputError, after the warnings, where textures are missing (require_complete_pbr).
+    """
+    yield from scene.notes
+    # The parts of generated objects overlap on purpose.
+    if not generated and (inner := enclosed_bodies_warning(TriMesh(scene.vertices, scene.faces), welded=False)):
+        yield inner
+    if complete:
+        require_complete_pbr(scene, name)
 
 
 def require_complete_pbr(scene: Scene, name: str) -> None:
@@ -56,81 +63,6 @@ def require_complete_pbr(scene: Scene, name: str) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Placement:
-    """How to place an object.
-
-    source: what its scene was read from; name: of the object. views: a folder whose object's place is taken over.
-    normalize: whether to centre and scale it to the unit box. turn: the largest turn about the vertical, in degrees;
-    the angle is drawn by seed and name.
-    """
-
-    source: Folder | Path | str
-    name: str
-    views: Folder | None
-    normalize: bool
-    turn: float
-    seed: int
-
-
-def place_scene(scene: Scene, placement: Placement) -> tuple[Scene, np.ndarray]:
-    """Bring a scene into the frame of the views; also returns source_from_world (4, 4).
-
-    Where a views folder is given, the scene is put where that folder's object was, if it comes from the same source. An
-    asset is in its folder's frame, and a scene whose box is about normalised stays. Any other is normalised.
-    """
-    identity = np.eye(4)
-    used = scene.vertices[np.unique(scene.faces)]
-    box = unit_box(used)
-    matrix = box if placement.normalize else identity
-    if placement.turn:
-        matrix = _turned(used, placement)
-    views = placement.views
-    if views is not None and placement.normalize:
-        digests = [entry.digest for entry in views.manifest.inputs if entry.role == "source"]
-        asset = _asset_of(placement.source)
-        if asset is not None:
-            in_source = asset.content.frame == "source"
-            matrix = np.array(asset.content.source_from_world).reshape(4, 4) if in_source else identity
-        elif sources.digest(placement.source) in digests:
-            matrix = np.array(views.content.source_from_world).reshape(4, 4)
-        elif abs(box[0, 0] - 1) < ABOUT_NORMALISED and np.abs(box[:3, 3]).max() < ABOUT_NORMALISED:
-            matrix = identity
-    if np.array_equal(matrix, identity):
-        return scene, identity
-    directions = {}
-    if matrix[:3, :3].astype(bool).sum() > 3:  # turned, and not only scaled
-        rotation = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
-        directions = {
-            name: np.concatenate([x[:, :3] @ rotation, x[:, 3:]], 1)
-            for name in ("normals", "tangents")
-            if (x := getattr(scene, name)) is not None
-        }
-    vertices = transform_points(invert_similarity(matrix), scene.vertices)
-    return dataclasses.replace(scene, vertices=vertices, **directions), matrix
-
-
-def _turned(vertices: np.ndarray, placement: Placement) -> np.ndarray:
-    """Draw a turn about the y axis: source_from_world (4, 4), normalised where asked for."""
-    rng = np.random.default_rng([placement.seed, seed_of(placement.name), 1])
-    angle = np.radians(rng.uniform(-placement.turn, placement.turn))
-    source_from_turned = np.eye(4)
-    source_from_turned[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
-    if not placement.normalize:
-        return source_from_turned
-    return source_from_turned @ unit_box(vertices @ source_from_turned[:3, :3])
-
-
-def _asset_of(source: Any) -> Folder | None:
-    """Return the asset folder that a source is, or that its file lies in."""
-    if isinstance(source, Folder):
-        return source
-    if isinstance(source, Path) and is_folder(source.parent):
-        folder = open_folder(source.parent, check=False)
-        return folder if folder.kind == "asset" else None
-    return None
-
-
 class Lamps(NamedTuple):
     """The light of one object in the forms it is used in; record is that of light.json."""
 
@@ -146,7 +78,7 @@ def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
     The number is drawn by seed and the object's name. Another light is returned as it is.
     """
     if light == "random" and views is not None:
-        used = views.content.environment
+        used = views.content_as(ViewsContent).environment
         # A light from an image file is not here to be read again.
         light = used if used.startswith("random:") or used in BUNDLED else light
     if light == "random":
@@ -164,13 +96,81 @@ def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf:
     return Lamps(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))
 
 
-def render_view(
-    renderer: Renderer, camera: Camera, samples: int, lamps: Lamps | None, domains: tuple[str, ...], exposure: float
+@dataclass(frozen=True)
+class ViewOptions:
+    """Choose how views are rendered: most samples per pixel, images to keep by domain, factor on the color."""
+
+    samples: int
+    domains: tuple[str, ...]
+    exposure: float
+
+
+def render_views(
+    renderer: Renderer,
+    cameras: list[Camera],
+    lamps: Lamps | None,
+    options: ViewOptions,
+    progress: Callable = lambda iterable, total, label: iterable,
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Render the images of all views by domain, (k, h, w[, 3]) float32, and their coverage (k, h, w).
+
+    lamps may be None where domains have neither "color" nor "closed_form". progress(iterable, total, label) reports the
+    views done.
+    """
+
+    def render(camera: Camera) -> dict[str, np.ndarray]:
+        return _render_view(renderer, camera, lamps, options)
+
+    frames = list(progress(renderer.render_each(render, cameras), len(cameras), "views"))
+    domains = [domain for domain in (*DOMAINS, "closed_form") if domain in options.domains]
+    images = {domain: np.stack([frame[domain] for frame in frames]) for domain in domains}
+    return images, np.stack([frame["mask"] for frame in frames])
+
+
+def _render_view(
+    renderer: Renderer, camera: Camera, lamps: Lamps | None, options: ViewOptions
 ) -> dict[str, np.ndarray]:
-    """Render one view's images by domain, "color" and "closed_form" only where domains ask for them."""
-    frame = renderer.buffers(camera, samples, lamps.direct.color(exposure) if "color" in domains else None)
-    if "closed_form" in domains:
+    """Render one view's images by domain, "color" and "closed_form" only where they are asked for."""
+    shade = lamps.direct.color(options.exposure) if lamps is not None and "color" in options.domains else None
+    frame = renderer.buffers(camera, options.samples, shade)
+    if lamps is not None and "closed_form" in options.domains:
         from gdtool.shading.bsdf.closed_form import closed_form_image
 
-        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, lamps.direct.brdf) * exposure
+        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, lamps.direct.brdf) * options.exposure
     return frame
+
+
+def condition_cameras(count: int, size: int, name: str, seed: int) -> list[Camera]:
+    """Draw the cameras of condition pictures, size pixels wide, by seed and the object's name."""
+    rng = np.random.default_rng([seed, seed_of(name)])
+    return [condition_camera(rng, f"{i:03d}", size) for i in range(count)]
+
+
+def render_conditions(
+    renderer: Renderer, cameras: list[Camera], direct: DirectLight, options: ViewOptions
+) -> Iterator[np.ndarray]:
+    """Render a condition picture (h, w, 4) for each camera: sRGB with straight alpha, in [0, 1]."""
+    shade = direct.color(options.exposure)
+    for frame in renderer.render_each(lambda camera: renderer.buffers(camera, options.samples, shade), cameras):
+        color = srgb_from_linear(np.clip(frame["color"], 0, 1))
+        yield np.concatenate([color, frame["mask"][..., None]], -1)
+
+
+def clipped_share(images: dict[str, np.ndarray], mask: np.ndarray) -> float:
+    """Compute the share of color values on the object that are above 1; 0 without color images."""
+    return float((images["color"][mask > 0] > 1).mean()) if "color" in images else 0.0
+
+
+def figures(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: Lamps | None) -> dict[str, float]:
+    """Collect the figures of the manifest."""
+    report = {
+        "faces": len(scene.faces),
+        "materials": len(scene.materials),
+        "samples": renderer.counts.samples,
+        "shadow_rays": renderer.counts.shadow_rays,
+        "foreground_share": float((mask > 0).mean()),
+    }
+    if lamps is not None:
+        report["environment_scale"] = lamps.environment.scale
+        report |= {f"light_fit_{name}": value for name, value in lamps.record["fit_error"].items()}
+    return report

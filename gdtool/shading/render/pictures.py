@@ -16,13 +16,16 @@ from gdtool.shading.bsdf.sg import SphericalGaussians
 from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Goal, Renderer
 
+# The most samples per pixel of a view that seconds or a PSNR end.
+OPEN_ENDED = 4096
+
 
 @dataclass(frozen=True)
 class PictureOptions:
     """How to render pictures.
 
-    samples: the most per pixel. exposure: factor on the color. brdf: of the closed form. seconds: for all views
-    together. psnr: estimated dB at which a view is done.
+    samples: the most per pixel of a view that no goal ends. exposure: factor on the color. brdf: of the closed form.
+    Goals: seconds, for all views together; psnr, the estimated dB at which a view is done.
     """
 
     samples: int
@@ -31,6 +34,11 @@ class PictureOptions:
     seconds: float | None = None
     psnr: float | None = None
 
+    @property
+    def most_samples(self) -> int:
+        """The most samples per pixel."""
+        return self.samples if self.seconds is None and self.psnr is None else OPEN_ENDED
+
 
 class Pictures(NamedTuple):
     """Each view's picture (h, w, 4) sRGB with alpha, share of clipped pixels, and estimated PSNR in dB or None."""
@@ -38,6 +46,16 @@ class Pictures(NamedTuple):
     images: list[np.ndarray]
     clipped: list[float]
     psnr: list[float | None]
+
+    @property
+    def clipped_share(self) -> float:
+        """Mean share of clipped pixels."""
+        return float(np.mean(self.clipped))
+
+    @property
+    def least_psnr(self) -> float | None:
+        """Least estimated PSNR in dB; None where none was estimated."""
+        return min((value for value in self.psnr if value is not None), default=None)
 
 
 def render_pictures(
@@ -58,7 +76,7 @@ def render_pictures(
         if options.seconds is not None:
             # Each view gets an equal part of the time that is left.
             seconds = max(0.0, options.seconds - (time.perf_counter() - begun)) / (len(cameras) - number)
-        frame = renderer.buffers(camera, options.samples, shade, Goal(seconds, options.psnr))
+        frame = renderer.buffers(camera, options.most_samples, shade, Goal(seconds, options.psnr))
         out.psnr.append(renderer.counts.estimated_psnr)
         if shade is None:
             frame["color"] = closed_form_image(frame, camera, light, options.brdf) * options.exposure

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.cameras import Camera, camera_at
-from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
+from gdtool.cameras.camera import DISTANCE, HALF_WIDTH, SIX_VIEWS, rig
 
 
 def camera(
@@ -40,6 +40,20 @@ def sphere(views: int, size: int, fov: float = 0.0) -> list[Camera]:
     return out
 
 
+def cameras_by_rig(name: str, views: int, size: int, elevation: float = 0.0, fov: float = 0.0) -> list[Camera]:
+    """Place the cameras of a rig: "turntable" or "sphere" of so many views, else the six views of "six" or "wonder3d".
+
+    elevation is that of a turntable, and of six perspective views.
+    """
+    if name == "turntable":
+        return turntable(views, size, elevation, fov)
+    if name == "sphere":
+        return sphere(views, size, fov)
+    if fov:
+        return turntable(0, size, elevation, fov, SIX_VIEWS)
+    return rig(name, size)
+
+
 def condition_camera(rng: np.random.Generator, name: str, size: int) -> Camera:
     """Draw a camera in front of the object, as a photographer would stand.
 
@@ -51,4 +65,4 @@ def condition_camera(rng: np.random.Generator, name: str, size: int) -> Camera:
     return camera(0.0, float(elevation), name, size, float(fov) if perspective else 0.0, HALF_WIDTH / float(scale))
 
 
-__all__ = ["DISTANCE", "camera", "condition_camera", "sphere", "turntable"]
+__all__ = ["DISTANCE", "camera", "cameras_by_rig", "condition_camera", "sphere", "turntable"]

@@ -1,0 +1,128 @@
+"""Run the steps from a target and its source to maps, and record what each step left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gdtool.bake.inputs import SourceChoice, path_of, read_origin
+from gdtool.bake.lods import make_levels
+from gdtool.bake.maps import MapOptions, Maps, make_maps, require_map_memory
+from gdtool.bake.occlusion import bake_occlusion
+from gdtool.bake.origin import Origin
+from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
+from gdtool.bake.reproject import vertex_reach
+from gdtool.bake.target import Target, Texels, fineness, texel_width, texels_of
+from gdtool.core.errors import InputError
+from gdtool.core.sources import Source
+from gdtool.core.stage import Output
+from gdtool.geometry.meshes import TriMesh
+
+# World units; a source whose detail is finer counts as this fine.
+FINEST_DETAIL = 1e-12
+
+Report = dict[str, bool | int | float | str]
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Choose what to bake, and how to store it.
+
+    size, samples: of the maps, None where the source's detail decides (target.fineness). occlusion_rays per traced
+    point, drawn by seed; 0: no ambient occlusion. height, confidence: make these maps too. bits per channel. padding in
+    texels; 0: all that are free. normal_map: "auto" leaves a flat one out.
+    """
+
+    size: int | None
+    samples: int | None
+    occlusion_rays: int
+    seed: int
+    height: bool
+    confidence: bool
+    bits: int
+    padding: int
+    normal_map: Literal["auto", "on", "off"]
+
+
+def read_source(
+    source: Source, choice: SourceChoice, target: Target, matrix: np.ndarray, name: str, out: Output
+) -> Origin:
+    """Read the surface or model to bake from, and warn where it is inside out beside the target.
+
+    source is what the mesh was read from; matrix (4, 4) maps the normalised frame to the model's.
+    """
+    origin, turned = read_origin(source, choice, target, matrix)
+    for what, why in choice.skipped:
+        out.skip(what, why)
+    if turned:
+        out.warn(f"{name}: what it is baked from is inside out beside it; the faces are taken the other way round")
+    return origin
+
+
+def rasterise(
+    source: Source, target: Target, origin: Origin, options: StepOptions, name: str, out: Output
+) -> tuple[Texels, int]:
+    """Choose the size of the maps and the samples per texel, and find the texels that the target's charts cover.
+
+    Returns texels and samples. Raises ResourceError for maps beyond the free memory, InputError without any texel.
+    """
+    size, samples = fineness(target, origin.detail, options.size, options.samples)
+    if options.samples is None and samples == 1:
+        times = texel_width(target, size) / max(origin.detail, FINEST_DETAIL)
+        out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one stands for it")
+    require_map_memory(name, size)
+    with out.step("rasterise"):
+        texels = texels_of(target, size, threads=out.threads)
+    if not texels.inside:
+        raise InputError(path_of(source), "its texture coordinates cover no texel", "run gdtool unwrap")
+    return texels, samples
+
+
+def bake_maps(
+    target: Target, texels: Texels, origin: Origin, samples: int, options: StepOptions, out: Output
+) -> tuple[Maps, Report]:
+    """Bake the texels' values and occlusion, and make maps of them; also returns the report."""
+    with out.step("bake"):
+        reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
+        how = BakeOptions(samples, out.threads, options.height, options.confidence)
+        baked = bake(target, texels, origin.source, origin.lookup, reach, how, out.progress)
+    occlusion = None
+    if options.occlusion_rays:
+        with out.step("occlusion"):
+            trace = occlusion_tracer(
+                target, origin.source, reach, origin.normals, options.occlusion_rays, options.seed, out.threads
+            )
+            occlusion = bake_occlusion(target, texels, trace, threads=out.threads)
+    else:
+        out.skip("occlusion", "left out by --no-ao")
+    with out.step("maps"):
+        cutoff = {"least_alpha": origin.alpha_cutoff} if origin.alpha_mode == "MASK" else {}
+        storage = MapOptions(options.bits, options.padding or None, options.normal_map, threads=out.threads, **cutoff)
+        maps = make_maps(texels, baked.values, occlusion, storage)
+    for what, reason, seconds in maps.skipped:
+        out.skip(what, reason, seconds)
+    if options.normal_map == "off":
+        out.skip("normal map", "left out by --normal-map off")
+    return maps, {
+        **baked.report,
+        "seen_share": baked.seen_share(texels.inside),
+        "materials_from": origin.label,
+        "detail": origin.detail,
+        "samples": samples,
+    }
+
+
+def add_levels(target: Target, count: int, report: Report, out: Output) -> tuple[Target, ...]:
+    """Make coarser levels of detail until there are `count` with the full one, and add their figures to the report."""
+    if count < 2:
+        return ()
+    with out.step("levels of detail"):
+        levels = make_levels(target, count, out.threads)
+    for what, why in levels.skipped:
+        out.skip(what, why)
+    for warning in levels.warnings:
+        out.warn(warning)
+    report |= levels.report
+    return tuple(levels.targets)
