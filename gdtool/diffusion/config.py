@@ -1,7 +1,7 @@
 """Configure the diffusion model and its training; the presets `paper`, `small` and `tiny` run the same code.
 
-ModelConfig holds everything that a model folder needs to be rebuilt (its config.json), TrainConfig everything that a
-run needs.
+ModelConfig is a model folder's config.json: what is needed to build the network again. TrainConfig is what a training
+run needs in addition.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
 
 
 class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe the network, its inputs and its noise. Sizes in pixels unless said otherwise."""
+    """Describe the network, its inputs and its noise. Sizes are in pixels unless a comment says otherwise."""
 
     image_size: Pixels = 64
     views: Annotated[tuple[str, ...], Meta(min_length=1)] = (
@@ -93,14 +93,14 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     revision: str = ""  # branch, tag or commit of a hub id; "": its main branch
 
     def __post_init__(self) -> None:
-        """Raise ValueError, which msgspec reports as its ValidationError, where the fields do not fit one another."""
+        """Raise ValueError where the fields do not fit one another; msgspec reports it as its ValidationError."""
         fault = _fault(self)
         if fault:
             raise ValueError(fault)
 
 
 def _fault(config: ModelConfig) -> str | None:
-    """Describe the first field of which no network can be made, and its bound; None where all fit."""
+    """Describe the first field from which no network can be built, and its bound. Returns None where all fields fit."""
     known = [name for name, _ in SIX_VIEWS]
     for field, values, names in (("views", config.views, known), ("domains", config.domains, DOMAINS)):
         unknown = [value for value in values if value not in names]
@@ -146,8 +146,10 @@ def _fault(config: ModelConfig) -> str | None:
 
 
 class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe a part of the training: until `share` of the run is over, each step sees `domains` and `views` of an
-    object.
+    """Describe a part of the training.
+
+    The phase lasts until `share` of the run is over, 0 to 1. Each of its steps trains on `domains` of the domains and
+    `views` of the views of an object.
     """
 
     share: Share = 1.0

@@ -22,8 +22,11 @@ OTHER_START = (
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point
-    numbers."""
+    """Compare the tensors of a file with the parameters of a network, by name.
+
+    path: the file that errors name. wanted: the network's state_dict, on any device. Raises InputError for the first
+    tensor that is missing, unknown, of another shape or not of a floating-point type.
+    """
     for name, tensor in wanted.items():
         if name not in tensors:
             raise InputError(path, f"lacks tensor {name}", OTHER_WEIGHTS)
@@ -52,7 +55,10 @@ def read_config(path: Path) -> ModelConfig:
 
 
 def configured(fields: object, subject: object) -> ModelConfig:
-    """Convert parsed JSON to a ModelConfig. Raises InputError that names subject, the field and its bound."""
+    """Convert parsed JSON to a ModelConfig.
+
+    subject: the file or folder that an error names. Raises InputError that names the wrong field and its bound.
+    """
     try:
         return msgspec.convert(fields, ModelConfig)
     except msgspec.ValidationError as error:
@@ -62,9 +68,10 @@ def configured(fields: object, subject: object) -> ModelConfig:
 
 
 def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
-    """Build the network's structure without numbers. Raises ResourceError where its weights would not fit in memory.
+    """Build the network on PyTorch's meta device, which holds shapes and no values, and check that its weights fit.
 
-    bytes_per_weight: bytes held for each weight, for example BYTES_TO_LOAD.
+    bytes_per_weight: bytes of memory held for each weight, for example BYTES_TO_LOAD. subject: the file or folder that
+    an error names. Raises ResourceError where the weights would not fit in memory.
     """
     shape = structure(config)
     weights = parameter_count(shape)
@@ -75,8 +82,8 @@ def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) ->
 def load_model(folder: Path) -> Model:
     """Load the Model of a folder, in evaluation mode, float32.
 
-    Raises InputError for damaged or mismatched files, ResourceError where it does not fit in memory. Nothing of the
-    size of its weights is allocated before the configuration and the weights are known to fit one another.
+    Raises InputError for damaged or mismatched files, and ResourceError where the model does not fit in memory. Memory
+    for the weights is allocated only after the configuration and the file have been checked against each other.
     """
     config = read_config(folder / "config.json")
     wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
@@ -88,7 +95,10 @@ def load_model(folder: Path) -> Model:
 
 
 def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -> None:
-    """Write config.json and model.safetensors in half precision; path_of maps a name to where it is written."""
+    """Write config.json and model.safetensors, the weights in float16.
+
+    path_of: function from a file's name to the path that it is written to. tensors: the model's weights by name.
+    """
     from safetensors.torch import save
 
     Path(path_of("config.json")).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=1) + b"\n")
@@ -97,10 +107,11 @@ def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -
 
 
 def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
-    """Start a UNet from Stable Diffusion's weights (diffusers names); returns the names that keep their initial values.
+    """Copy Stable Diffusion's weights, named as in diffusers, into a UNet.
 
-    conv_in grows by the condition's channels and class labels by the domains, both with zeros. Raises InputError for a
-    tensor that is not known here or has another shape.
+    The UNet's conv_in has more input channels (for the condition), and its class embedding more inputs (for the
+    domains). The added columns are zero. Returns the names of the parameters that keep their initial values. Raises
+    InputError for a tensor that the UNet lacks or that has another shape.
     """
     state = unet.state_dict()
     for name, tensor in tensors.items():

@@ -61,19 +61,23 @@ class _Scheduler(msgspec.Struct):
 
 
 def recognises(folder: Path) -> bool:
-    """Tell whether a folder has the layout of a diffusers pipeline."""
+    """Check whether a folder has the layout of a diffusers pipeline."""
     return (folder / "unet" / "config.json").is_file()
 
 
 def renamed(name: str) -> str:
-    """Translate a key of the published weights, older spellings included, to this network's."""
+    """Translate a key of the published weights, in the older spelling or the newer one, to a key of this network."""
     for old, new in LEGACY:
         name = name.replace(old, new)
     return name
 
 
 def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
-    """Derive the configuration from unet/config.json and scheduler/. Raises InputError for another structure."""
+    """Derive the configuration from unet/config.json and scheduler/scheduler_config.json.
+
+    tensors: the UNet's weights by name; they show where in a block the attention across domains stands. Raises
+    InputError for a structure other than Wonder3D's.
+    """
     path = folder / "unet" / "config.json"
     unet = _read(path, _UNet)
     scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
@@ -120,8 +124,9 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
 
 
 def load(folder: Path):
-    """Load a published folder as a Model, in evaluation mode, float32. Raises InputError for a missing or unused
-    tensor.
+    """Load a published folder as a Model, in evaluation mode, float32.
+
+    Raises InputError for a missing or unused tensor.
     """
     if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
         raise InputError(
@@ -152,8 +157,8 @@ def load(folder: Path):
 def premultiplied_normals(x: torch.Tensor) -> torch.Tensor:
     """Convert normals (…, 3, h, w) in [-1, 1] over white to normals times coverage, the encoding of gdtool's models.
 
-    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: a value nearer to white
-    is an edge.
+    A pixel of coverage m and unit normal n lies m |n - 1| from white (1, 1, 1), which is at least 0.73 m. So a pixel
+    nearer to white than 0.73 is partly covered, and its distance over 0.73 estimates m.
     """
     m = ((x - 1).norm(dim=-3, keepdim=True) / NEAREST_NORMAL).clamp(0, 1)
     n = (x - (1 - m)) / m.clamp_min(1e-3)
@@ -164,7 +169,7 @@ _Typed = TypeVar("_Typed")
 
 
 def _read(path: Path, kind: type[_Typed]) -> _Typed:
-    """Read a JSON file of a type. Raises InputError that names the field where it does not fit."""
+    """Read a JSON file into the msgspec struct `kind`. Raises InputError that names the field that does not fit."""
     if not path.exists():
         raise InputError(path, "does not exist", "copy the whole folder")
     try:

@@ -1,8 +1,8 @@
 """Read views folders from .tar files, one object at a time: training data that travels as a few large files.
 
-Two namings are read. Plain is what `tar cf shard-0.tar cat.asset/views dog.asset/views` makes. In WebDataset's, the
-files of an object share a key and stand together: KEY.manifest.json, KEY.color.front.png for color/front.png, and so
-on.
+Members may be named in two ways. Plain names are those that `tar cf shard-0.tar cat.asset/views dog.asset/views`
+writes. In WebDataset's naming the files of an object share a key and follow each other: KEY.manifest.json,
+KEY.color.front.png for color/front.png, and so on.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _BLOCK = 1 << 20  # bytes copied at a time
 
 
 def placed(member: str) -> tuple[str, str]:
-    """Split a member's name into its object and its path inside the object's views folder."""
+    """Split a member's name into the name of its object and the path inside that object's views folder."""
     path = PurePosixPath(member)
     key, _, extension = path.name.partition(".")
     if "." in extension:  # WebDataset: KEY.manifest.json, KEY.color.front.png
@@ -58,8 +58,9 @@ def placed(member: str) -> tuple[str, str]:
 def object_count(archive: Path) -> int:
     """Count the views folders in a .tar by reading its headers.
 
-    Raises InputError unless it is a whole tar of regular files with names that stay inside, ResourceError for more
-    members or bytes than the limits above.
+    Raises InputError unless it is a whole tar whose names stay inside the folder that it is unpacked to. Raises
+    ResourceError for more than MAX_MEMBERS members, or for an archive that would unpack to more than MAX_RATIO times
+    its size.
     """
     with _opened_tar(archive) as tar:
         count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
@@ -69,10 +70,11 @@ def object_count(archive: Path) -> int:
 
 
 def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
-    """Unpack the views folders of a .tar one after another under workspace, removing each again.
+    """Unpack the views folders of a .tar under workspace, one after another; each is removed before the next.
 
-    An object's members must stand together, as tar and WebDataset write them. Each header is checked before its content
-    is unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
+    An object's members must follow each other, as tar and WebDataset write them. Each header is checked before its
+    content is unpacked. Raises InputError and ResourceError as object_count(), and OutputError where workspace cannot
+    be written.
     """
     root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
     try:
@@ -103,9 +105,9 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
 
 
 class _LongHeader(Exception):
-    """An extended header claims more than MAX_HEADER_BYTES.
+    """Report an extended header that claims more than MAX_HEADER_BYTES.
 
-    Not one of tarfile's errors, which tarfile would take for another format.
+    It does not derive from tarfile's errors: on those, tarfile goes on and tries another format.
     """
 
 
@@ -136,7 +138,7 @@ def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
 
 @contextmanager
 def _malformed(archive: Path) -> Iterator[None]:
-    """Convert what tarfile and the decompressors raise for bytes that are no tar to one InputError."""
+    """Convert the errors of tarfile and of the decompressors, for bytes that are no tar, to InputError."""
     try:
         yield
     except _LongHeader as error:
@@ -158,7 +160,7 @@ def _malformed(archive: Path) -> Iterator[None]:
 
 
 def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """Yield the regular files of an archive after checking each header: its name, its kind, and the limits."""
+    """Yield the regular files of an archive. Each header's name, kind and sizes are checked first."""
     packed, count, size = max(archive.stat().st_size, 1), 0, 0
     while True:
         with _malformed(archive):
@@ -186,8 +188,9 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
 
 
 def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Copy a member's bytes to target. Raises InputError for a truncated archive, OutputError where target cannot be
-    written.
+    """Copy a member's bytes to target.
+
+    Raises InputError for a truncated archive, OutputError where target cannot be written.
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -213,7 +216,7 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
 
 
 def _place(root: Path, name: str, archive: Path) -> Path:
-    """Return the folder under root that an object is unpacked into; data/objects.py takes its name for the object's."""
+    """Return the folder under root that an object is unpacked into. Its parent is named after the object."""
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
     if fault:

@@ -22,9 +22,9 @@ FINEST = 8  # pixels of picture.png across one of a view
 class PictureOptions:
     """Set how a picture becomes a condition.
 
-    mask: path of an image that is bright where the subject is. matting: path of an ONNX network. crop: centre and scale
-    the subject as in training, else keep the picture's framing. extent: longest side of the framed subject as a share
-    of the image. size: pixels of the condition.
+    mask: path of an image that is bright where the subject is. matting: path of an ONNX network that separates the
+    subject. crop: centre and scale the subject as in training; otherwise the picture's framing stays. extent: longest
+    side of the framed subject, as a share of the image. size: side of the condition in pixels.
     """
 
     mask: str | None
@@ -35,7 +35,7 @@ class PictureOptions:
 
 
 def wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
-    """Describe a mask whose size (width, height) is not the picture's."""
+    """Make the error for a mask whose size (width, height) is not the picture's."""
     return InputError(
         mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}"
     )
@@ -44,9 +44,11 @@ def wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> Inp
 def condition_of(
     path: Path, name: str, options: PictureOptions, warn: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frame the picture: (size, size, 4), linear color and straight alpha, and the same at the picture's resolution.
+    """Read a picture, cut its subject out and frame it, at the model's size and at about the picture's resolution.
 
-    The second is a whole number of times finer, FINEST at most. Raises InputError without a usable subject.
+    Returns two images of the same square: (size, size, 4) and (f size, f size, 4), float32, linear color and straight
+    alpha. The whole number f, 1 to FINEST, keeps the picture's resolution best. warn: called with a text where the
+    subject may be cut off. Raises InputError for a picture without a usable subject.
     """
     image = read_image(path)
     if min(image.shape[:2]) < LEAST_PIXELS:
@@ -90,5 +92,5 @@ def extent_of(convention: str) -> float:
 
 
 def encoded_rgba(image: np.ndarray) -> np.ndarray:
-    """Encode linear color to sRGB in (h, w, 4), clipped to [0, 1]; alpha stays linear."""
+    """Encode the linear color of (h, w, 4) to sRGB, clipped to [0, 1]. Alpha is clipped only."""
     return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)

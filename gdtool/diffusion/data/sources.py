@@ -11,7 +11,7 @@ from gdtool.diffusion.data.archives import object_count, views_of
 
 
 def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator[Folder]:
-    """Yield the views folders of folders, datasets and archives; an archive's are unpacked under workspace."""
+    """Yield the views folders of folders, datasets and archives. Those of an archive are unpacked under workspace."""
     parts = []
     for source in sources:
         if isinstance(source, Path):
@@ -22,7 +22,7 @@ def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator
 
 
 def count_views_folders(sources: Iterable[Folder | Path]) -> int:
-    """Count what views_folders() yields; of archives only the headers are read."""
+    """Count the folders that views_folders() yields, by manifests and by the headers of archives."""
     return sum(_count(source) for source in sources)
 
 

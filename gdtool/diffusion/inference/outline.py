@@ -1,8 +1,9 @@
-"""Add parts that the picture shows, and that the sampled outlines leave no room for, to all views.
+"""Add parts that the picture shows, and that the sampled outlines leave no space for, to all views.
 
-The object's outline from the front is known exactly. The others are guesses of the model, from which thin parts
-(ribbons, arms, spires) fade first. A lost part is put where the other outlines come nearest to having a common point
-and where the front view's depth has it. It is as thick as it is wide, up to a bound.
+The object's outline from the front is that of the picture, and exact. The other outlines are sampled by the model, and
+thin parts (ribbons, arms, spires) fade first in them. A lost part is placed along the rays of the front view where the
+other outlines come nearest to having a common point, and near the front view's depth. It is as thick as it is wide, up
+to a bound.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ LEAST_FACING = 0.2  # cosine: least facing of a normal that is drawn
 
 @dataclass(frozen=True)
 class Part:
-    """Hold the n pixels of a lost part in the known view.
+    """Hold the n pixels of a lost part in the view whose outline is known.
 
-    row, column (n,); middle (n,): depth of the part's middle behind them; half (n,): half its thickness there, world
-    units; outward (n, 3): unit vector toward the nearest outline; lost (n,): where no other outline leaves room.
+    row, column (n,): the pixels. middle (n,): depth of the part's middle, in world units. half (n,): half its
+    thickness, in world units. outward (n, 3): unit vector toward the nearest outline. lost (n,): false for the pixels
+    around the part that join it to the rest of the object.
     """
 
     row: np.ndarray
@@ -44,9 +46,14 @@ class Part:
 def lost_part(
     soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None
 ) -> Part | None:
-    """Find what the known view's mask shows and the other masks (k, h, w) leave no room for; None for nothing.
+    """Find the pixels of the known view behind which the other masks leave no space; None where there are none.
 
-    soft (k, h, w): coverage as the model sampled it. depth (h, w): of the known view, where there is one.
+    Args:
+        soft: (k, h, w), coverage as the model sampled it, 0 to 1.
+        mask: (k, h, w), coverage after sharpening; that of the known view is exact.
+        cameras: of the k views.
+        known: index of the known view.
+        depth: (h, w), the known view's depth in world units, or None.
     """
     from scipy.ndimage import binary_dilation, binary_opening, distance_transform_edt, gaussian_filter
 
@@ -89,7 +96,7 @@ def lost_part(
 
 
 def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
-    """Add the part to every mask (k, h, w)."""
+    """Add the part to a copy of the masks (k, h, w), except to that of the view with index `known`."""
     out = mask.copy()
     for k in range(len(cameras)):
         if k != known:
@@ -101,8 +108,8 @@ def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int)
 def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
     """Draw the part into the images (k, h, w[, c]) of all domains, in place.
 
-    It has the known view's values, the depth at which each view sees it, and the normals of a rod along it. mask (k, h,
-    w): before the part was added.
+    Its colors and materials are those of the known view. Its depth is computed for each view, and its normals are those
+    of a rod along it. mask (k, h, w): the masks before the part was added. known: index of the known view.
     """
     known_values = {domain: image[known].copy() for domain, image in images.items()}
     for k in range(len(cameras)):
@@ -121,9 +128,10 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
 
 
 def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
-    """Find the pixels (row, column) of view k in which the part is nearest to it.
+    """Project the part into view k, and keep the point nearest to the camera in each pixel.
 
-    Also returns its depth there, its normal (n, 3), and the index of the part's pixel.
+    shape: (h, w) of the views. Returns, for m pixels: row (m,), column (m,), depth (m,), unit normal (m, 3), and the
+    index (m,) of the part's pixel that is seen there.
     """
     camera = cameras[known]
     steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)

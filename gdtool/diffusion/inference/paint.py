@@ -1,10 +1,10 @@
-"""Restore the picture's contrast in the albedo of the view that shows it.
+"""Restore the picture's contrast in the albedo of the view that shows the picture.
 
-A model reproduces that view's color, which is the picture, whole, and about half of the albedo's contrast. Color over
-albedo is light. On a surface under distant light it is a smooth function of the normal. So the albedo is set to the
-color times a factor that is, around each pixel, as linear in the normal as the model's own. That alone would make paint
-of highlights and shadows. The model tells how far the color's detail is paint: where its albedo lacks the detail,
-nothing is changed.
+The model reproduces the color of that view with all of its contrast, and the albedo with about half of it. Color
+divided by albedo is light, which on a surface under distant light is a smooth function of the normal. So the albedo is
+set to the color times a factor. Around each pixel the factor is the linear function of the normal that fits the model's
+own ratio of albedo to color best. That alone would turn highlights and shadows into paint. So the model's albedo
+decides how far a detail of the color is paint: where the albedo lacks the detail, nothing is changed.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ def repainted(
     normal: np.ndarray | None = None,
     metallic: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Add the paint that color (h, w, 3), linear, shows to the albedo (h, w, 3), linear.
+    """Add to the albedo (h, w, 3) the painted detail that the color (h, w, 3) shows; both are linear, 0 to 1.
 
-    Also returns how far each pixel was changed (h, w), 0 to 1. mask (h, w) coverage; normal (h, w, 3) unit; metallic
-    (h, w): a metal's color is a reflection, so it is not used. Without normals light is taken to be smoother than the
-    detail.
+    mask (h, w): coverage. normal (h, w, 3): unit; without it light is assumed to vary over more pixels than the detail.
+    metallic (h, w): pixels of metal are left as they are, since a metal's color is a reflection. Returns the new
+    albedo, and how far each pixel (h, w) was changed, 0 to 1.
     """
     log_color, log_albedo = (np.log(np.clip(image, 0, None) + DARK, dtype=np.float64) for image in (color, albedo))
     gain = np.clip((detail_gain(log_color, log_albedo, mask) - LIGHT) / (PAINT - LIGHT), 0, 1)

@@ -1,4 +1,4 @@
-"""Sample a condition's images and tell the user what to expect of them."""
+"""Sample the views of a picture, and warn the user where they are likely to be poor."""
 
 from __future__ import annotations
 
@@ -25,9 +25,10 @@ def sample_condition(
     name: str,
     out: Output,
 ) -> dict[str, torch.Tensor]:
-    """Sample a framed picture (size, size, 4); returns domain to encoded images (1, k, 3, h, w).
+    """Sample all views from a framed picture (size, size, 4); returns encoded images (1, k, 3, h, w) by domain.
 
-    Warns of a picture unlike the model's training, whose ranges ranges_folder holds. name: of the picture.
+    ranges_folder: model folder with the ranges of the training pictures; a picture outside them brings a warning.
+    compiled: whether to compile the network first. name: the picture's name in warnings.
     """
     rgba = to_tensor_condition(condition)
     strange = unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
@@ -50,9 +51,10 @@ def tell_doubts(
     name: str,
     out: Output,
 ) -> None:
-    """Warn where the result's figures show that the model is unsure of it.
+    """Warn where the figures of a result exceed their usual range: the model is unsure of its views.
 
-    The usual values were measured with the model's default options, so nothing is told with others.
+    report: the figures, as result.views_from_images() returns them. The usual ranges were measured with the model's
+    default options. With other options no warning is given, and the manifest lists the check as skipped.
     """
     default = (
         options.steps == config.sampling_steps

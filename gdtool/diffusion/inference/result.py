@@ -21,25 +21,26 @@ DECIDED = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
-    """Double the slope of a model's coverage at the outline.
+    """Double the slope of sampled coverage (…, h, w), 0 to 1, around the value OUTLINE.
 
-    It is soft where the model is unsure of the outline; a real outline is a pixel wide.
+    Coverage is soft where the model is unsure of the outline, but a real outline is one pixel wide.
     """
     return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
 
 
 def decided(metallic: torch.Tensor) -> torch.Tensor:
-    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer: the odds to the power DECIDED.
+    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer, by raising its odds to the power DECIDED.
 
-    A material is a metal or is none. A model's value in between says how sure it is, and is on average nearest at
-    neither.
+    A material is a metal or it is none. A sampled value in between says how sure the model is.
     """
     yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
     return yes / (yes + no)
 
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """Average the coverage (k, h, w) of orthographic cameras that face one another: they see one outline, mirrored."""
+    """Average the coverage (k, h, w) of each two orthographic views from opposite sides: they show one outline,
+    mirrored.
+    """
     out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):
@@ -51,10 +52,11 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
 
 
 def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """Move depth (k, h, w) so that no point lies beyond the outline of another view, coverage (k, h, w), in its row.
+    """Move depth (k, h, w) so that no point projects outside the outline of another view.
 
-    A point is moved along its ray, within the camera's range. Only pairs of upright orthographic cameras of one size
-    take part, whose rows are at one height: one view's rays run along the other's rows.
+    mask (k, h, w) is the views' coverage, 0 to 1. A point moves along its ray, between the camera's near and far plane.
+    Only pairs of upright orthographic cameras at one height and of one pixel size take part. Their rows match, so a ray
+    of one view projects into a row of the other.
     """
     out, (height, width) = depth.astype(np.float64), mask.shape[1:]
     for k, camera in enumerate(cameras):
@@ -85,8 +87,9 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
 
 
 def _begin(mask: np.ndarray) -> np.ndarray:
-    """Find the column (h,) at which each row's coverage (h, w) first passes one half, between pixel centres; 0 where
-    never.
+    """Find the column (h,) at which the coverage (h, w) of each row first reaches one half.
+
+    Interpolates between pixel centres; pixel i covers i to i + 1. Returns 0 for a row that stays below one half.
     """
     row, first = np.arange(len(mask)), (mask > 0.5).argmax(1)
     inner, outer = mask[row, first], np.where(first > 0, mask[row, first - 1], 0.0)
@@ -100,14 +103,21 @@ def views_from_images(
     domains: tuple[str, ...],
     picture_alpha: np.ndarray | None = None,
 ) -> tuple[Views, dict[str, float]]:
-    """Convert encoded images (k, 3, h, w) of one object to Views of the asked domains, with one mask per view, and a
-    report.
+    """Convert encoded images (k, 3, h, w) of one object to the Views of some domains, and report what was corrected.
 
-    picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette and, mirrored, the back's
-    (both orthographic), so neither is guessed. The front color, nearly the picture itself, is divided by it.
+    Args:
+        images: by domain, as sample_images() returns them, of one object.
+        cameras: of the k views.
+        background: encoded value that the images are composited over.
+        domains: those to return.
+        picture_alpha: (h, w), coverage of the framed picture. It replaces the sampled silhouette of the front view and,
+            mirrored, that of the back view. The front view's color is divided by it, since that color is nearly the
+            picture.
 
-    The report: drawn_share of the picture that the other views had no room for (outline.py); painted_share whose albedo
-    got the picture's contrast (paint.py); outline_blur in pixels and row_mismatch (familiarity.result_figures).
+    Returns:
+        The views with one mask each, and a report. drawn_share: share of the picture that the other views had no space
+            for (see outline.py). painted_share: share whose albedo got the picture's contrast (see paint.py).
+            outline_blur in pixels and row_mismatch: see familiarity.result_figures().
     """
     from gdtool.images.color import linear_from_srgb
 

@@ -14,7 +14,7 @@ from gdtool.diffusion.network.tensors import pretrained_part
 
 
 class EncoderLayer(nn.Module):
-    """Pre-norm transformer layer."""
+    """Apply a transformer layer with pre-normalisation to tokens (b, t, width)."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -29,9 +29,9 @@ class EncoderLayer(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """Small transformer over the condition's patches, trained with the rest.
+    """Encode the condition's patches with a small transformer that is trained together with the UNet.
 
-    It runs once per object, not once per image, so depth is cheap here.
+    It runs once for each object instead of once for each image, so layers cost little here.
     """
 
     def __init__(self, config: ModelConfig):
@@ -54,10 +54,10 @@ class PatchEncoder(nn.Module):
 
 
 class ClipEncoder(nn.Module):
-    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as in Stable Diffusion Image Variations.
+    """Encode the condition as one 768-wide token, the projected embedding of a frozen CLIP ViT-L/14.
 
-    Image Variations' model card resizes tensors bicubically without antialiasing. Wonder3D uses CLIP's processor, with
-    it.
+    Stable Diffusion Image Variations does the same. Its model card resizes pictures bicubically without antialiasing.
+    Wonder3D resizes them with CLIP's processor, which antialiases.
     """
 
     # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
@@ -90,5 +90,5 @@ class ClipEncoder(nn.Module):
 
 
 def make_encoder(config: ModelConfig) -> nn.Module:
-    """Create the configuration's encoder."""
+    """Create the image encoder that the configuration names."""
     return ClipEncoder(config) if config.encoder == "clip" else PatchEncoder(config)

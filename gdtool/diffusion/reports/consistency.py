@@ -1,7 +1,7 @@
-"""Measure whether the views of one object fit one another, without ground truth.
+"""Measure whether the views of one object agree, without ground truth.
 
-The domains overlap: the lit maps are the color, depth's slopes are the normals, and a point seen by two cameras is one
-point.
+The domains overlap: the material maps under light give the color, the slopes of depth give the normals, and a point
+that two cameras see is the same point.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ SEEN = 0.1  # a point this far behind what another view sees is hidden from it, 
 
 
 def consistency(views: Views) -> dict[str, float]:
-    """Compute rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units) and
-    reprojection_share.
+    """Compute four measures of agreement, by name, as rerendered_psnr(), slope_degrees() and reprojection() define
+    them.
 
-    The last is the share of points within 0.02.
+    They are rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units) and
+    reprojection_share (of points within 0.02 world units).
     """
     distance, share = reprojection(views)
     return {
@@ -32,10 +33,12 @@ def consistency(views: Views) -> dict[str, float]:
 
 
 def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
-    """PSNR in dB (sRGB, foreground) of the normal, albedo, roughness and metallic views under one light against color.
+    """Compute the PSNR in dB of the color views against the other maps, shaded under one light.
 
-    The light is the spherical Gaussians that explain the color best (least squares at some pixels of all views); the
-    figure is taken at other pixels. Closed form: shadows and reflections of the object in itself count as error."""
+    The light is the sum of spherical Gaussians that explains the color best, by least squares at `count` random
+    foreground pixels of all views. The PSNR is taken in sRGB at as many other pixels. Shading is in closed form, so
+    shadows and reflections of the object in itself count as error.
+    """
     import torch
 
     from gdtool.fields.appearance.light import ShadedPoints, recover_light, unoccluded
@@ -68,7 +71,10 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
 
 
 def slope_degrees(views: Views) -> float:
-    """Measure the median degrees between the normals and depth's central differences, away from depth's edges."""
+    """Measure the median angle in degrees between the normals and the slope of depth, away from depth's edges.
+
+    The slope is a central difference over pixels that the object covers. NaN where no pixel can be used.
+    """
     angles = []
     for k, camera in enumerate(views.cameras):
         points = _points(camera, views.images["depth"][k])
@@ -87,10 +93,11 @@ def slope_degrees(views: Views) -> float:
 
 
 def reprojection(views: Views) -> tuple[float, float]:
-    """Reproject each view's points into the others: median distance along the axis, and share within 0.02.
+    """Project each view's points into the other views and compare depth: median difference, and share within 0.02.
 
-    A point is left out where it lies behind the other view's surface by more than SEEN: it is hidden. A point on the
-    other view's background counts as SEEN; one in front of its surface counts with its distance.
+    Differences are along the other camera's axis, in world units. A point that lies more than SEEN behind the other
+    view's surface is hidden there and left out. A point over the other view's background counts as SEEN. A point in
+    front of the surface counts with its difference.
     """
     distances = []
     for i, camera in enumerate(views.cameras):
@@ -113,6 +120,6 @@ def reprojection(views: Views) -> tuple[float, float]:
 
 
 def _points(camera, depth: np.ndarray) -> np.ndarray:
-    """Convert depth (h, w) along an orthographic camera's axis to world points (h, w, 3)."""
+    """Convert depth (h, w) along the axis of an orthographic camera, in world units, to world points (h, w, 3)."""
     origins, directions = rays(camera)
     return origins + depth[..., None] * directions

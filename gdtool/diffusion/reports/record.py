@@ -1,4 +1,4 @@
-"""Record a training run: validation pictures and events on the way, the model folder's files at the end."""
+"""Record a training run: validation pictures and TensorBoard events during it, the model folder's files at its end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ PICTURES_EACH = 2  # condition images of an object that are measured
 
 
 class Recorder:
-    """Write validation pictures, validation.csv and events of a run into its workspace."""
+    """Write validation pictures, validation.csv and TensorBoard events of a run into its workspace.
+
+    precision: of the network when it samples, "float32" or "bfloat16". tensorboard: whether to write events.
+    """
 
     def __init__(self, workspace: Path, shown: Objects, precision: str, tensorboard: bool):
         self.workspace, self.shown, self.precision = workspace, shown, precision
@@ -45,7 +48,7 @@ class Recorder:
             self.events.picture(state.step, grid)
 
     def observers(self, out: Output) -> Observers:
-        """Return the functions that a training reports to."""
+        """Return the functions that the training loop calls to report."""
         log = {} if self.events is None else {"log": self.events.scalars}
         return Observers(validate=self.validate, warn=out.warn, progress=out.progress, **log)
 
@@ -66,7 +69,10 @@ class Recorder:
 def write_results(
     out: Output, recorder: Recorder, state: State, objects: Objects, order: Order, preset: str, ablation: str
 ) -> None:
-    """Write the model folder: averaged weights, records of the run, ranges of the pictures, card and content."""
+    """Write the model folder: averaged weights, loss curve, validation, ranges of the pictures, and model card.
+
+    Sets the content of the folder's manifest as well.
+    """
     save_model(out.path, order.model, state.average)
     recorder.copy_to(out)
     every = range(0, order.used, max(order.used // MOST_PICTURES, 1))

@@ -19,11 +19,11 @@ from gdtool.diffusion.network.encoding import BACKGROUND, encode
 
 
 def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dict[str, float]]:
-    """Sample validation objects: a picture (h, w, 3) in [0, 1] and the PSNR in dB of each domain.
+    """Sample the validation objects; returns a picture (h, w, 3) in [0, 1] and the PSNR in dB by domain.
 
-    The picture has a row per domain for each object: the condition, the true views and the sampled ones. PSNR is of the
-    encoded images (0 is grey), over all views but the front one, mean over views and objects. Sampled by the averaged
-    weights in as many steps as the model asks for, four at most.
+    The picture has, for each object, the condition on the left and a row for each domain: the true views, then the
+    sampled ones. PSNR compares encoded images, in which 0 is grey. It is the mean over objects and all views but the
+    front one. The averaged weights are used, in as many steps as the model is sampled with by default, four at most.
     """
     model, config = state.model, state.model.config
     device = next(model.parameters()).device
@@ -53,8 +53,9 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
 
 
 def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, float]) -> None:
-    """Add a row to validation.csv; rows of this step and later ones are dropped, because a resumed run writes them
-    again.
+    """Add a row to validation.csv, with the PSNR in dB by domain.
+
+    Rows of this step and later ones are removed first, because a resumed run writes them again.
     """
     head = ["step", "seconds", *psnr]
     kept = []
@@ -71,7 +72,7 @@ def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, flo
 
 
 def _tile(images: torch.Tensor) -> np.ndarray:
-    """Arrange (d, k, 3, h, w) in [-1, 1] as a picture (d h, k w, 3) in [0, 1]."""
+    """Arrange images (d, k, 3, h, w) in [-1, 1] as one picture (d h, k w, 3) in [0, 1]."""
     d, k, c, h, w = images.shape
     return (0.5 + 0.5 * images).permute(0, 3, 1, 4, 2).reshape(d * h, k * w, c).numpy()
 

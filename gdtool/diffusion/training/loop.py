@@ -1,9 +1,9 @@
-"""Run the training loop: draw, add noise, predict, compare, step, average, log.
+"""Run the training loop: draw a batch, add noise, predict, compute the loss, step, average the weights, log.
 
-A run is a pure function of data, configuration and seed. Each step's choices come from (seed, step) and those of each
-of its objects from (seed, step, place in the batch), so that the split of a batch over accumulations and processes does
-not matter. A checkpoint holds the rest (weights, their average, the optimiser's moments), so that a resumed run equals
-the unbroken one bit for bit. distributed.py holds what several processes do differently.
+A run is a pure function of data, configuration and seed. The choices of a step are seeded by (seed, step), those of an
+object by (seed, step, place in the batch). So it does not matter how a batch is split over accumulations and processes.
+A checkpoint holds the rest: weights, their average and the optimiser's moments. So a resumed run equals one that was
+never stopped, bit for bit. distributed.py holds what differs between several processes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run 
 
 @dataclass
 class State:
-    """Hold everything that changes while training."""
+    """Hold everything that changes while training: model, optimiser, averaged weights by name, step and time."""
 
     model: Model
     optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
@@ -56,7 +56,11 @@ class State:
 
 @dataclass(frozen=True)
 class Step:
-    """Hold the random choices of one step that all its objects share, and the seeds of each object's."""
+    """Hold the random choices of one step.
+
+    domains: indices into DOMAINS, and views (k,): indices into the configuration's views; both are common to all
+    objects of the batch. seed, number: of the run and of the step, which seed the choices of each object.
+    """
 
     domains: tuple[int, ...]
     views: torch.Tensor
@@ -64,7 +68,7 @@ class Step:
     number: int
 
     def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
-        """Return the generators of the object at this place of the step's batch."""
+        """Return the generators for the object at this place of the step's batch: NumPy's, and PyTorch's on the CPU."""
         choices = np.random.default_rng((self.seed, 3, self.number, place))
         return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
 
@@ -82,7 +86,7 @@ class Objective(torch.nn.Module):
 
 
 def new_state(model: Model, train: TrainConfig) -> State:
-    """Create the state before the first step; wrapped for all processes."""
+    """Create the state before the first step, with the objective wrapped for all processes."""
     objective = distributed.wrap(Objective(model, train))
     optimizer = make_optimizer(model, train)
     average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
@@ -90,23 +94,29 @@ def new_state(model: Model, train: TrainConfig) -> State:
 
 
 def progress_of(state: State, train: TrainConfig, minutes: float | None) -> float:
-    """Return the share of the run that is over, 0…1: by steps, or by minutes where those are given and spent sooner."""
+    """Return the share of the run that is over, 0 to 1: the greater of those by steps and by minutes.
+
+    minutes: limit of the run's time, or None.
+    """
     return min(max(state.step / train.steps, state.seconds / 60 / minutes if minutes else 0.0), 1.0)
 
 
 def phase_at(progress: float, train: TrainConfig) -> Phase:
-    """Return the phase at this progress."""
+    """Return the phase of the training at a progress, 0 to 1."""
     return next((phase for phase in train.phases if progress < phase.share), train.phases[-1])
 
 
 def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
-    """Return the learning rate: warm-up, the phase's rate, and cosine decay where configured."""
+    """Compute the learning rate: the phase's rate times the warm-up, and times a cosine decay where configured."""
     rate = phase_at(progress, train).learning_rate * min((state.step + 1) / train.warmup, 1.0)
     return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
 
 
 def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
-    """Choose a step's domains and views; color always where it is primary and more than one domain is drawn."""
+    """Choose a step's domains and views at random.
+
+    In a model with attention across domains, color is among the domains wherever there is more than one.
+    """
     choices = np.random.default_rng((seed, 2, step))
     modelled = [DOMAINS.index(d) for d in config.domains]
     if phase.domains >= len(modelled):
@@ -122,9 +132,10 @@ def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
 def losses(
     model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig
 ) -> dict[str, torch.Tensor]:
-    """Compute the objective of one micro-batch and its parts by name; every figure is a mean over its objects.
+    """Compute the objective of a micro-batch of b objects, "loss", and its parts by name, each a mean over the objects.
 
-    generators: one for each object, the source of all that is random about it.
+    generators: b, one for each object. They decide its timestep, noise, background, dropped conditions and shaded
+    pixels.
     """
     config, b, device = model.config, len(batch.planes), batch.planes.device
     layout = Layout(b, step.domains, len(step.views))
@@ -190,7 +201,11 @@ def losses(
 def train_step(
     state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str
 ) -> dict[str, float]:
-    """Take one optimiser step over the phase's objects in `accumulate` parts; updates state."""
+    """Take one optimiser step, and update the state.
+
+    The phase's batch is split into `accumulate` parts, one after the other. minutes: limit of the run's time, or None.
+    Returns the step's row of loss.csv. Raises InputError for a batch smaller than the number of processes.
+    """
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
     step = choose(config, phase, seed, state.step)
@@ -234,7 +249,10 @@ def train_step(
 
 
 def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
-    """Write weights, average and moments beside the old checkpoint, then replace it."""
+    """Write weights, averages and moments to a file beside the old checkpoint, then replace it.
+
+    identity: text that a resumed run must match.
+    """
     from safetensors.torch import save_file
 
     tensors = {}
@@ -253,7 +271,10 @@ def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
 
 
 def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
-    """Restore state from the workspace's checkpoint, if any. Raises InputError when it belongs to another run."""
+    """Restore the state from the workspace's checkpoint, and return whether there was one.
+
+    Raises InputError when it belongs to a run with another identity.
+    """
     path = workspace / CHECKPOINT
     if not path.is_file():
         return False
@@ -301,7 +322,11 @@ class _Record(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Set a run: seed, limit in minutes, steps between checkpoints and between validations, device."""
+    """Set how a run goes, apart from its configuration.
+
+    seed: of all random choices. minutes: limit of the time spent in steps, None for none. checkpoint_every,
+    validate_every: in steps. device: a torch device.
+    """
 
     seed: int
     minutes: float | None = None
@@ -312,7 +337,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Observers:
-    """Hold the functions that a run reports to: validation, warnings, log rows and a progress bar."""
+    """Hold the functions that the training loop calls: for validation, warnings, rows of the log, and progress."""
 
     validate: Callable[[State], None] = lambda state: None
     warn: Callable[[str], None] = lambda message: None
@@ -328,10 +353,10 @@ def run_training(
     options: RunOptions,
     observers: Observers = Observers(),
 ) -> State:
-    """Train until the steps or the minutes are spent, resuming from workspace.
+    """Train until all steps or minutes are spent, resuming from the checkpoint in workspace where there is one.
 
-    The first process writes workspace/loss.csv and passes each of its rows to log. Raises InputError when MOST_SKIPPED
-    steps in a row had a gradient that is not finite; before that it warns of each.
+    The first process writes workspace/loss.csv and passes each row to observers.log. A step whose gradient is not
+    finite is skipped with a warning. Raises InputError after MOST_SKIPPED such steps in a row.
     """
     identity = msgspec.json.encode([model.config, train, options.seed, len(objects)]).decode()
     torch.manual_seed(options.seed)
@@ -368,7 +393,7 @@ def run_training(
 
 
 def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
-    """Warn of a skipped step. Raises InputError after MOST_SKIPPED in a row."""
+    """Warn where the last step was skipped. Raises InputError after MOST_SKIPPED skipped steps in a row."""
     if state.skipped >= MOST_SKIPPED:
         raise InputError(
             "training",
@@ -380,7 +405,10 @@ def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
 
 
 def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
-    """Create a writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
+    """Create a writer of loss.csv that keeps the rows up to `step`.
+
+    A resumed run starts at its checkpoint and writes the later rows again.
+    """
     columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
     kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 class Events:
-    """Write event files to a folder, from the first record on. Raises ResourceError without the package tensorboard."""
+    """Write TensorBoard event files to a folder. Raises ResourceError without the package tensorboard.
+
+    The files are created at the first record.
+    """
 
     def __init__(self, folder: Path):
         try:
@@ -24,7 +27,7 @@ class Events:
         self._open, self._folder, self._writer = SummaryWriter, folder, None
 
     def _at(self, step: int):
-        """Return the writer, opened at its first step."""
+        """Return the writer. The first call creates it, and hides older events of this step and later ones."""
         # A resumed run goes over the steps since its checkpoint again: those of before are purged.
         if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
@@ -42,6 +45,6 @@ class Events:
         self._at(step).add_image("validation", grid, step, dataformats="HWC")
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the event files."""
         if self._writer is not None:
             self._writer.close()
