@@ -38,9 +38,7 @@ def decided(metallic: torch.Tensor) -> torch.Tensor:
 
 
 def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """Average the coverage (k, h, w) of each two orthographic views from opposite sides: they show one outline,
-    mirrored.
-    """
+    """Average the coverage (k, h, w) of orthographic views from opposite sides, whose outlines are mirror images."""
     out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):

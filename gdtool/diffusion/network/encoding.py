@@ -98,7 +98,10 @@ def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, .
 
 
 def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-    """Composite the premultiplied color of rgba (b, 4, h, w) in [-1, 1] over backgrounds (b,). Coverage stays as it is."""
+    """Composite the premultiplied color of rgba (b, 4, h, w) in [-1, 1] over backgrounds (b,).
+
+    Coverage stays as it is.
+    """
     behind = (0.5 - 0.5 * rgba[:, 3:]) * background[:, None, None, None]
     return torch.cat([rgba[:, :3] + behind, rgba[:, 3:]], 1)
 

@@ -17,8 +17,7 @@ SEEN = 0.1  # a point this far behind what another view sees is hidden from it, 
 
 
 def consistency(views: Views) -> dict[str, float]:
-    """Compute four measures of agreement, by name, as rerendered_psnr(), slope_degrees() and reprojection() define
-    them.
+    """Compute four measures of agreement, by name, as the functions below define them.
 
     They are rerendered_psnr (dB), slope_degrees (median), reprojection_depth (median, world units) and
     reprojection_share (of points within 0.02 world units).

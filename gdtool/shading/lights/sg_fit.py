@@ -1,4 +1,4 @@
-"""Fit spherical Gaussians to an environment."""
+"""Fit spherical Gaussians to the radiance of an environment, and measure the fit's error."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ IRRADIANCE_WEIGHT = 30.0
 def fit_sg(
     environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300
 ) -> tuple[SphericalGaussians, dict[str, float]]:
-    """Fit count lobes to an environment's radiance; also returns the fit's error (see fit_error).
+    """Fit count lobes to an environment's radiance; also returns the fit's errors, by name as fit_error() gives them.
 
-    Half of the lobes start at the brightest places, each hiding its surroundings from the next. The other half are
-    spread evenly. Adam optimises axes, log sharpness and log amplitudes for that many steps. The loss is the squared
-    error of the radiance's square root, by solid angle, plus that of irradiance: so neither the sun nor the sky is all
-    that counts. Raises ValueError for an environment without light.
+    Half of the lobes start at the brightest places; each start excludes its surroundings from the next. The other half
+    start evenly spread. Adam then optimises axes, log sharpness and log amplitudes for `steps` steps. The loss has two
+    parts: the squared error of the square root of radiance, weighted by solid angle, and the squared error of
+    irradiance. The root keeps the sun from outweighing the sky. Raises ValueError for an environment without light.
     """
     import torch
 
@@ -74,10 +74,10 @@ def fit_sg(
 
 
 def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, float]:
-    """Measure a fit's errors on the environment's 32-row image.
+    """Measure how well lobes match an environment, on its image of about 32 rows.
 
     radiance_rms: RMS error over the sphere, relative to the RMS radiance. irradiance_rms, irradiance_max: RMS and
-    largest error over normals, relative to the RMS and the largest irradiance. energy: relative error of the total.
+    largest error over 256 normals, relative to the RMS and the largest irradiance. energy: relative error of the total.
     """
     import torch
 
@@ -103,9 +103,9 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
 def _start(
     d: np.ndarray, radiance: np.ndarray, weight: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Choose the fit's starting axes (k, 3), sharpness (k,) and amplitudes (k, 3).
+    """Choose the fit's starting axes (k, 3), sharpness (k,) and amplitudes (k, 3); k = count.
 
-    d (n, 3) are the pixels' directions, radiance (n, 3), weight (n,) their solid angles.
+    d (n, 3): unit directions of the pixels. radiance (n, 3): theirs, with mean 1. weight (n,): their solid angles.
     """
     peaks = count // 2
     bright = radiance.sum(1)

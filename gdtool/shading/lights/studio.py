@@ -21,12 +21,12 @@ RANDOM_HEIGHT = 64
 def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
     """Prepare the light that source names: random:NUMBER, a bundled light, or a lat-long file.
 
-    A random studio is made of lobes: nothing is fitted, and the error is that of its pixels. Without fit, other lights
-    have no lobes and an empty error. seed: of the fit.
+    A random light is made of lobes, so nothing is fitted; its error is that of the image made from them. seed: of the
+    fit. fit: whether to fit lobes to other lights; otherwise these have no lobes and no error.
 
     Returns:
-        The metered environment, its lobes, and the record of light.json. Raises InputError for a source that is none
-        of these.
+        The metered environment, its lobes, and the record that light.json stores. Raises InputError for a source that
+            is none of these.
     """
     import torch
 

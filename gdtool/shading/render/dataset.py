@@ -57,11 +57,11 @@ def require_complete_pbr(scene: Scene, name: str) -> None:
 
 @dataclass(frozen=True)
 class Placement:
-    """How to place an object.
+    """Describe how an object is placed in the views' frame.
 
-    source: what its scene was read from; name: of the object. views: a folder whose object's place is taken over.
-    normalize: whether to centre and scale it to the unit box. turn: the largest turn about the vertical, in degrees;
-    the angle is drawn by seed and name.
+    source: what the scene was read from. name: the object's. views: a views folder of the same object whose placing is
+    repeated, or None. normalize: whether to centre and scale the scene to the unit box. turn: the largest turn about
+    the y axis, in degrees. seed: decides the angle, together with the name.
     """
 
     source: Folder | Path | str
@@ -73,10 +73,12 @@ class Placement:
 
 
 def place_scene(scene: Scene, placement: Placement) -> tuple[Scene, np.ndarray]:
-    """Bring a scene into the frame of the views; also returns source_from_world (4, 4).
+    """Move a scene into the views' frame; also returns the matrix source_from_world (4, 4).
 
-    Where a views folder is given, the scene is put where that folder's object was, if it comes from the same source. An
-    asset is in its folder's frame, and a scene whose box is about normalised stays. Any other is normalised.
+    Without placement.views the scene is normalised and turned as the placement says. With a views folder, and with
+    placement.normalize, the first of these rules that applies is followed. An asset is placed by the frame that its
+    folder records. A scene from the views' source is placed as that folder placed it. A scene whose bounding box is
+    about normalised stays. Any other scene is normalised.
     """
     identity = np.eye(4)
     used = scene.vertices[np.unique(scene.faces)]
@@ -110,7 +112,10 @@ def place_scene(scene: Scene, placement: Placement) -> tuple[Scene, np.ndarray]:
 
 
 def _turned(vertices: np.ndarray, placement: Placement) -> np.ndarray:
-    """Draw a turn about the y axis: source_from_world (4, 4), normalised where asked for."""
+    """Choose a random turn about the y axis: source_from_world (4, 4), normalised where the placement says so.
+
+    vertices (v, 3): those that faces use. The angle is uniform within placement.turn degrees to either side.
+    """
     rng = np.random.default_rng([placement.seed, seed_of(placement.name), 1])
     angle = np.radians(rng.uniform(-placement.turn, placement.turn))
     source_from_turned = np.eye(4)
@@ -121,7 +126,7 @@ def _turned(vertices: np.ndarray, placement: Placement) -> np.ndarray:
 
 
 def _asset_of(source: Any) -> Folder | None:
-    """Return the asset folder that a source is, or that its file lies in."""
+    """Return the asset folder that a source is, or that its file is in, else None."""
     if isinstance(source, Folder):
         return source
     if isinstance(source, Path) and is_folder(source.parent):
@@ -131,7 +136,11 @@ def _asset_of(source: Any) -> Folder | None:
 
 
 class Lamps(NamedTuple):
-    """The light of one object in the forms it is used in; record is that of light.json."""
+    """Hold the light of one object in four forms.
+
+    environment: metered. lobes: spherical Gaussians. record: what light.json stores. direct: estimates light on surface
+    points.
+    """
 
     environment: Environment
     lobes: SphericalGaussians
@@ -140,9 +149,10 @@ class Lamps(NamedTuple):
 
 
 def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
-    """Resolve the light "random": to that of the views, where a name brings it back, else to random:NUMBER.
+    """Resolve the light "random" to a name that studio() takes; any other light is returned unchanged.
 
-    The number is drawn by seed and the object's name. Another light is returned as it is.
+    With a views folder it is the name of that folder's light, if it is a random or a bundled one. Otherwise it is
+    random:NUMBER, where seed and the object's name decide the number.
     """
     if light == "random" and views is not None:
         used = views.content.environment
@@ -154,7 +164,10 @@ def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
 
 
 def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf: str) -> Lamps:
-    """Prepare a light by its name; samples: directions per point, from the light and from the reflection each."""
+    """Prepare a light by its name, as studio() takes it, for shading the renderer's scene.
+
+    samples: directions that a point draws from the light, and as many from its reflection. brdf: "gltf" or "paper".
+    """
     import torch
 
     # Shading runs in threads of this program, a chunk each; torch's would only wait for each other.
@@ -166,7 +179,11 @@ def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf:
 def render_view(
     renderer: Renderer, camera: Camera, samples: int, lamps: Lamps | None, domains: tuple[str, ...], exposure: float
 ) -> dict[str, np.ndarray]:
-    """Render one view's images by domain, "color" and "closed_form" only where domains ask for them."""
+    """Render one view's images (h, w[, c]) by domain; "color" and "closed_form" only where domains has them.
+
+    samples: the most samples of a pixel. lamps: may be None where neither of the two is rendered. exposure: factor on
+    color.
+    """
     frame = renderer.buffers(camera, samples, lamps.direct.color(exposure) if "color" in domains else None)
     if "closed_form" in domains:
         from gdtool.shading.bsdf.closed_form import closed_form_image

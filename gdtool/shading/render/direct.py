@@ -48,12 +48,11 @@ SUMS = 10
 
 @dataclass(frozen=True)
 class LightOptions:
-    """How DirectLight estimates.
+    """Set how DirectLight estimates the light.
 
-    mode: "sampled" becomes exact as samples grow. "prefiltered" takes the reflection from the split sum, and from the
-    samples only its visible share.
-    shadows: whether rays decide what is visible.
-    control_variate: whether unshadowed diffuse light comes from the irradiance table.
+    mode: "sampled" converges to the exact value with more samples. "prefiltered" takes the reflection from the split
+    sum, and only its visible share from samples. shadows: whether rays decide what is visible. control_variate: whether
+    unshadowed diffuse light comes from the irradiance table.
     """
 
     mode: Literal["sampled", "prefiltered"] = "sampled"
@@ -62,7 +61,11 @@ class LightOptions:
 
 
 class _RayCounts(NamedTuple):
-    """Shadow rays of a chunk: cast, and not needed since below the horizon, on a convex object, toward little light."""
+    """Count the shadow rays of a chunk of points: those cast, and those left out, for three reasons.
+
+    below_horizon: the direction is below the horizon. convex: nothing can hide a point of a convex object. rare: the
+    direction brings little light.
+    """
 
     cast: int = 0
     below_horizon: int = 0
@@ -71,10 +74,10 @@ class _RayCounts(NamedTuple):
 
 
 class _Candidates(NamedTuple):
-    """Directions of n points, k each, that may need shadow rays.
+    """Hold the k directions of each of n points that may need shadow rays.
 
-    direction: three (k, n) tensors; above (k, n) bool, over the horizon; brightness (k, n), what each would bring;
-    roulette (k, n), uniform numbers.
+    direction: three (k, n) tensors. above (k, n) bool: above the horizon. brightness (k, n): luminance that would be
+    reflected without shadows. roulette (k, n): uniform numbers in [0, 1).
     """
 
     direction: list
@@ -87,7 +90,7 @@ class DirectLight:
     """Estimate the light that surface points reflect toward the eye.
 
     Args:
-        renderer: of the scene that casts the shadows.
+        renderer: casts shadow rays in its scene.
         environment: the light.
         samples: directions that a point draws from the light, and as many from its reflection; rounded to a power of
             two. 0 leaves shadows out, in mode "prefiltered" only. Directions are weighted by the balance heuristic
@@ -139,7 +142,7 @@ class DirectLight:
         return tensor_of(np.stack(values).reshape(len(values), -1, self.samples).transpose(2, 0, 1))
 
     def color(self, exposure: float = 1.0) -> Callable[[ShadingPoints], dict[str, np.ndarray]]:
-        """Return the shading that Renderer.buffers takes for a color image, times exposure."""
+        """Return the function that Renderer.buffers takes to shade points; it multiplies the radiance by exposure."""
         return lambda points: {"color": self.radiance(points) * np.float32(exposure)}
 
     def radiance(self, points: ShadingPoints) -> np.ndarray:
@@ -175,10 +178,10 @@ class DirectLight:
         return out.T
 
     def _choose_runs(self, points: ShadingPoints) -> np.ndarray:
-        """Choose each point's run of the pool and of the pattern: indices (2, n).
+        """Choose each point's runs of directions in the two pools (of the light, of the reflection): indices (2, n).
 
-        The samples of a pixel use neighbouring runs. Together these are one larger stratified set, and so are the first
-        two, four or eight of them. A hash of the pixel's index chooses the block of runs and where in it to begin.
+        The samples of a pixel use neighbouring runs. Together these form one larger stratified set, and so do the first
+        two, four or eight of them. A hash of the pixel's index chooses the block of runs and the first run in it.
         """
         k = self.samples
         block = min(1 << max(0, points.per_pixel - 1).bit_length(), max(1, POOL // k // 16))
@@ -189,7 +192,10 @@ class DirectLight:
         return out
 
     def _accumulate(self, points: ShadingPoints, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> _RayCounts:
-        """Fill sums (SUMS, 3, n) of some of the points, and count their shadow rays."""
+        """Compute the sums (SUMS, 3, n) of the n points that `part` selects, in place, and count their shadow rays.
+
+        runs: the points' indices from _choose_runs(), or None for no samples.
+        """
         import torch
 
         k = self.samples
@@ -231,7 +237,7 @@ class DirectLight:
         return counted
 
     def _pixel(self, x, y, z):
-        """Find the flat pixel index of directions, as Environment.pixel_of but in float32."""
+        """Find the flat index of the environment's pixels that directions (x, y, z) fall into, in float32."""
         import torch
 
         height, width = self.environment.image.shape[:2]
@@ -242,11 +248,11 @@ class DirectLight:
     def _apply_shadows(
         self, position: np.ndarray, surface: PointReflection, candidates: _Candidates, weights: tuple
     ) -> _RayCounts:
-        """Set the first of two weights (k, n) to 0 for the directions that something hides.
+        """Cast shadow rays, and set the first of two weights (k, n) to 0 where something hides the light.
 
         Russian roulette saves rays toward little light. A direction brighter than ROULETTE_SHARE of the mean of its
         point's directions is always followed. A darker one is followed with a probability proportional to its
-        brightness, and its weights grow by the inverse: the mean stays what it is.
+        brightness. Its weights are then divided by that probability, so that the mean stays the same.
         """
         import torch
 
@@ -311,14 +317,18 @@ class DirectLight:
 
 
 def _visible_share(visible: np.ndarray, everything: np.ndarray, known: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Estimate the visible share (m,) of the light in each run of points (3, n) that begins at starts (m,)."""
+    """Estimate the visible share of the light, 0 to 1, for each of m pixels.
+
+    visible, everything, known (3, n): sums over visible directions, over all directions, and from tables, for the
+    pixels' points. starts (m,): index of each pixel's first point.
+    """
     r, g, b = LUMINANCE.astype(np.float32)
     v, u, k = (np.add.reduceat(r * x[0] + g * x[1] + b * x[2], starts) for x in (visible, everything, known))
     return np.clip((v + PRIOR * k) / np.maximum(u + PRIOR * k, np.float32(1e-20)), 0, 1)
 
 
 def _hashed(index: np.ndarray, seed: int) -> np.ndarray:
-    """Hash indices (n,) and a seed to well-mixed non-negative int64, by SplitMix64."""
+    """Hash indices (n,) and a seed to non-negative int64 by SplitMix64."""
     with np.errstate(over="ignore"):
         x = splitmix64(index.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15) % 2**64))
         return (x >> np.uint64(1)).astype(np.int64)

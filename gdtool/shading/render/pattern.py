@@ -1,4 +1,4 @@
-"""Place samples in a pixel."""
+"""Spread the samples of a pixel evenly inside it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ PATTERN_SEEDS = (4292928315, 3747378854)
 def pixel_pattern(count: int, first: int = 4) -> np.ndarray:
     """Make (count, 2) scrambled Sobol points in [0, 1)², to be used in passes.
 
-    The first pass has `first` points, each later one as many as all before it. Each pass is spread evenly, and so are
-    all passes up to it together. The scrambling is nested and hash-based (Burley 2020, "Practical hash-based Owen
+    The first pass has `first` points, and each later one as many as all before it. Each pass is spread evenly, and so
+    are all passes up to it together. The scrambling is nested and hash-based (Burley 2020, "Practical hash-based Owen
     scrambling"). Each pass is then shifted slightly, so that its mean is the pixel's centre and a linear function is
-    averaged exactly. (Without scrambling, the shift would put each pass on top of the one before.)
+    averaged exactly. Without scrambling, the shift would move each pass onto the one before.
     """
     index = np.arange(count, dtype=np.uint32)
     second = np.zeros(count, np.uint32)

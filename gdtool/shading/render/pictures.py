@@ -1,4 +1,4 @@
-"""Render lit pictures of a scene, under direct light or in closed form, until a goal is reached."""
+"""Render lit pictures of a scene, by sampled direct light or in closed form, until a time or a PSNR is reached."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from gdtool.shading.render.render import Goal, Renderer
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """How to render pictures.
+    """Set how pictures are rendered.
 
-    samples: the most per pixel. exposure: factor on the color. brdf: of the closed form. seconds: for all views
-    together. psnr: estimated dB at which a view is done.
+    samples: the most samples of a pixel. exposure: factor on the color. brdf: "gltf" or "paper", for closed form.
+    seconds: limit for all views together. psnr: estimated dB at which a view is done.
     """
 
     samples: int
@@ -33,7 +33,11 @@ class PictureOptions:
 
 
 class Pictures(NamedTuple):
-    """Each view's picture (h, w, 4) sRGB with alpha, share of clipped pixels, and estimated PSNR in dB or None."""
+    """Hold, for each view, the picture, its share of clipped pixels, and its estimated PSNR.
+
+    images: (h, w, 4), sRGB with alpha, 0 to 1. clipped: share of covered channels above 1. psnr: in dB, or None where
+    it was not estimated.
+    """
 
     images: list[np.ndarray]
     clipped: list[float]
@@ -47,9 +51,10 @@ def render_pictures(
     options: PictureOptions,
     progress: Callable = lambda iterable, total, label: iterable,
 ) -> Pictures:
-    """Render a picture for each camera: by direct light with shadows, or by lobes in closed form without.
+    """Render a picture for each camera.
 
-    progress(iterable, total, label) reports the views done.
+    light: DirectLight renders with shadows; SphericalGaussians shade in closed form without. progress(iterable, total,
+    label) wraps the loop over the views.
     """
     shade = light.color(options.exposure) if isinstance(light, DirectLight) else None
     out, begun = Pictures([], [], []), time.perf_counter()

@@ -1,4 +1,4 @@
-"""Look textures up: wrap modes, bilinear filter, box-filtered mip levels, sRGB decoded before filtering."""
+"""Look up textures: wrap modes, bilinear filter, box-filtered mip levels, sRGB decoded before filtering."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
 
 
 def same_layout(texture: Texture) -> tuple:
-    """Return a key of all that decides which texels and weights a uv reads; textures of one key are read together."""
+    """Return a key of all properties that decide which texels, with which weights, a UV coordinate reads.
+
+    Textures with the same key can be read together.
+    """
     return (
         texture.uv_set,
         texture.offset,
@@ -59,7 +62,7 @@ def same_layout(texture: Texture) -> tuple:
 
 
 class TextureReader:
-    """Read textures of one layout as linear float32, their channels side by side.
+    """Read textures of one layout (see same_layout) as linear float32, with their channels side by side.
 
     The finest level stays as the images store it. Coarser levels are box averages of about 2 x 2 texels, made when
     first needed. Several threads may read at once.
@@ -84,16 +87,19 @@ class TextureReader:
 
     @property
     def channels(self) -> int:
-        """How many channels all textures have together."""
+        """Return the number of channels of all textures together."""
         return self.parts[-1].stop
 
     @property
     def depth(self) -> int:
-        """How many levels there can be, down to one texel."""
+        """Return the number of mip levels, down to one texel."""
         return max(self.images[0].shape[:2]).bit_length()
 
     def stored(self, index: np.ndarray) -> np.ndarray:
-        """Decode texels (n,) of the finest level, by row-major index, to (n, c) linear float32; alpha is never sRGB."""
+        """Decode texels of the finest level to (n, c) linear float32; alpha is never sRGB.
+
+        index (n,): row-major.
+        """
         out = np.empty((len(index), self.channels), np.float32)
         for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
             texels = np.take(image.reshape(-1, image.shape[2]), index, axis=0)
@@ -101,9 +107,10 @@ class TextureReader:
         return out
 
     def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
-        """Decode stored texels (..., c) of one image into out, linear float32.
+        """Decode stored texels (..., c) of one image into out (..., c), linear float32.
 
-        Channel by channel: numpy is slow on rows as short as a texel.
+        colored: whether the image is sRGB. Channels are decoded one at a time, since numpy is slow on rows as short as
+        a texel.
         """
         for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
             if srgb:
@@ -112,7 +119,7 @@ class TextureReader:
                 np.multiply(texels[..., i], self._unit, out=out[..., i], dtype=np.float32, casting="same_kind")
 
     def _linear(self, values: np.ndarray) -> np.ndarray:
-        """Decode stored sRGB values to linear float32."""
+        """Decode stored sRGB values of any shape to linear float32."""
         return (
             linear_from_srgb(values).astype(np.float32, copy=False)
             if self._table is None
@@ -138,7 +145,7 @@ class TextureReader:
             return self.levels[k - 1]
 
     def _levelled(self, k: int, count: int) -> np.ndarray | None:
-        """Return level k decoded, or None where decoding single texels is cheaper for count more lookups."""
+        """Return level k decoded, or None where it is cheaper to decode only the texels of `count` more lookups."""
         if k:
             return self.level(k)
         with self._lock:
@@ -149,7 +156,7 @@ class TextureReader:
             return self._decoded
 
     def _make_next(self) -> None:
-        """Append the next coarser level."""
+        """Compute the next coarser level and append it to the levels."""
         finer = self.levels[-1:] or self.images
         parts = [slice(0, self.channels)] if self.levels else self.parts
         height, width = finer[0].shape[:2]
@@ -166,9 +173,9 @@ class TextureReader:
         self.levels.append(coarse)
 
     def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average 2 x 2 texels into out, rows of the coarser level from row on.
+        """Average 2 x 2 texels of finer (h, w, c) into out, the rows of the coarser level from `row` on.
 
-        colored: whether finer is stored in sRGB; None where it is linear float32.
+        Both sides of finer are even. colored: whether it is stored in sRGB; None where it is linear float32 already.
         """
         band = finer[2 * row : 2 * (row + len(out))]
         wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
@@ -182,7 +189,7 @@ class TextureReader:
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
     def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average as _halved_even where a side is odd: a coarser texel covers a bit of a third one, by its area."""
+        """Average as _halved_even, where a side is odd; a coarser texel then covers parts of three finer ones, by area."""
         rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
         band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
@@ -195,8 +202,9 @@ class TextureReader:
     def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
         """Read (n, c) linear float32 at uv (n, 2), to which the texture transform is applied.
 
-        texels_per_sample (n,) is the width of a sample's footprint, in texels of the finest level; NaN counts as 0. The
-        nearest level at least as sharp is read. So supersampling converges to the finest level's box average.
+        texels_per_sample (n,): width of a sample's footprint, in texels of the finest level; NaN counts as 0. The
+        coarsest level is read that is still sharp enough for the footprint. So supersampling converges to the finest
+        level's box average.
         """
         uv = transform_uv(self.texture, np.nan_to_num(np.asarray(uv, np.float64), posinf=0.0, neginf=0.0))
         if texels_per_sample is None or self.depth == 1 or self.texture.filter == "nearest":
@@ -214,7 +222,7 @@ class TextureReader:
         return out
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
-        """Read (n, c) from level k at transformed uv (n, 2)."""
+        """Read (n, c) linear float32 from level k at transformed uv (n, 2)."""
         image = self._levelled(k, len(uv))
         height, width = self.images[0].shape[:2] if image is None else image.shape[:2]
         flat = None if image is None else image.reshape(-1, self.channels)
@@ -242,7 +250,7 @@ class TextureReader:
 
 
 def _each_band(work, rows: int, band: int) -> None:
-    """Call work(first row) for every band of rows, on all cores."""
+    """Call work(first row) for every band of `band` rows, in threads on all cores."""
     starts = range(0, rows, band)
     if len(starts) > 1:
         with ThreadPoolExecutor(cores()) as pool:
@@ -252,7 +260,7 @@ def _each_band(work, rows: int, band: int) -> None:
 
 
 def _colored(channels: int, colored: bool) -> list[bool]:
-    """Tell which channels of an image are sRGB; alpha never is."""
+    """List for each channel of an image whether it is sRGB; alpha never is."""
     last = channels if channels in (1, 3) else channels - 1
     return [colored and i < last for i in range(channels)]
 
@@ -269,7 +277,7 @@ def _shares(size: int) -> np.ndarray:
 
 
 def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Interpolate a + fraction (b − a), overwriting b."""
+    """Interpolate a + fraction (b − a) for arrays that broadcast, overwriting b."""
     b -= a
     b *= fraction
     b += a
