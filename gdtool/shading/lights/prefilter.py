@@ -74,7 +74,7 @@ def octahedral_directions(side: int) -> np.ndarray:
 
 
 class LightPyramid:
-    """Hold an environment's mean radiance over solid angles of 1, 4, 16, … texels: a mip pyramid of octahedral images."""
+    """Hold an environment's mean radiance over solid angles of 1, 4, 16, … texels: a pyramid of octahedral images."""
 
     def __init__(self, environment: Environment):
         import torch

@@ -189,7 +189,7 @@ class TextureReader:
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
     def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average as _halved_even, where a side is odd; a coarser texel then covers parts of three finer ones, by area."""
+        """Average as _halve_even, where a side is odd; a coarser texel then covers parts of three finer ones, by area."""
         rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
         band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
