@@ -47,7 +47,7 @@ def configuration(
     except msgspec.ValidationError as error:
         raise InputError(file or "configuration", str(error), "correct that value in the file of --config") from None
     if size is not None:
-        from gdtool.diffusion.network.grow import resized
+        from gdtool.diffusion.network.grow import resize_config
 
-        model = resized(model, size)
+        model = resize_config(model, size)
     return model, train

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from gdtool.assets.scene import Scene
     from gdtool.cameras import Camera
-    from gdtool.shading.render.dataset import Lamps
+    from gdtool.shading.render.dataset import PreparedLight
     from gdtool.shading.render.direct import DirectLight
     from gdtool.shading.render.render import Renderer
 
@@ -130,7 +130,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     if options.condition_views or not {"color", "closed_form"}.isdisjoint(options.domains):
         with out.step("light"):
             light = dataset.light_name(options.light or "random", inputs.name, options.seed, views_given)
-            lamps = dataset.prepare_lamps(renderer, light, options.light_samples, options.seed, options.brdf)
+            lamps = dataset.prepare_light(renderer, light, options.light_samples, options.seed, options.brdf)
     with out.step("render"):
 
         def view(camera: Camera) -> dict[str, np.ndarray]:
@@ -225,7 +225,7 @@ def _write_conditions(
     write_cameras(out.path("condition.json"), cameras)
 
 
-def _report(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: Lamps | None) -> dict[str, float]:
+def _report(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: PreparedLight | None) -> dict[str, float]:
     """Collect the figures of the manifest."""
     report = {
         "faces": len(scene.faces),
@@ -240,7 +240,7 @@ def _report(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: Lamps | N
     return report
 
 
-def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: Lamps | None) -> None:
+def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: PreparedLight | None) -> None:
     """Record what the scene and the options did not need."""
     from gdtool.shading.render.skipped_work import skipped_work
 

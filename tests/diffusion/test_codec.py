@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.data.objects import draw
+from gdtool.diffusion.data.objects import draw_batch
 from gdtool.diffusion.network import codec as codecs
 from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.training.loop import choose, losses, phase_at
+from gdtool.diffusion.training.loop import choose_step, losses, phase_at
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 
@@ -86,17 +86,17 @@ def test_only_what_the_rendering_loss_looks_at_is_decoded(monkeypatch, near):
     monkeypatch.setattr(codecs.PatchCodec, "decode", lambda self, x: counts.append(len(x)) or plain(self, x))
     model, objects = Model(MODEL), spheres(2)
     train = msgspec.structs.replace(TRAIN, pure_noise=0.0)
-    step = choose(MODEL, phase_at(1.0, train), 0, 0)
+    step = choose_step(MODEL, phase_at(1.0, train), 0, 0)
     model.alpha = torch.full_like(model.alpha, 1e-3)
     model.sigma = torch.ones_like(model.sigma)
     choices, generators = zip(*(step.choices(place) for place in range(2)), strict=True)
     model.alpha[_timesteps(step)[:near]] = 3.0
-    losses(model, draw(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
+    losses(model, draw_batch(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
     assert sum(counts) == near * 4 * len(step.views)
 
 
 def _timesteps(step):
     """The timesteps that losses() draws for two objects."""
     choices = [step.choices(place) for place in range(2)]
-    draw(spheres(2), np.arange(2), MODEL, TRAIN, [one[0] for one in choices])
+    draw_batch(spheres(2), np.arange(2), MODEL, TRAIN, [one[0] for one in choices])
     return [int(torch.rand(4, generator=generator)[0] * MODEL.timesteps) for _, generator in choices]

@@ -9,13 +9,13 @@ from gdtool.diffusion.inference.familiarity import (
     DOUBTS,
     FILE,
     PictureRange,
-    doubts,
-    limits,
+    describe_doubts,
+    describe_unfamiliar,
+    figure_ranges,
     picture_figures,
-    ranges,
     read_ranges,
     result_figures,
-    unfamiliar,
+    usual_ranges,
     write_ranges,
 )
 
@@ -31,7 +31,9 @@ def box(width, height, brightness, noise=0.02, size=32, seed=0):
 
 @pytest.fixture
 def known():
-    return ranges(box(width, 20, brightness, seed=width) for width in range(10, 21) for brightness in (0.4, 0.5, 0.6))
+    return figure_ranges(
+        box(width, 20, brightness, seed=width) for width in range(10, 21) for brightness in (0.4, 0.5, 0.6)
+    )
 
 
 def test_a_boxes_figures():
@@ -40,10 +42,12 @@ def test_a_boxes_figures():
 
 
 def test_what_is_unlike_the_training_is_named(known):
-    assert unfamiliar(box(15, 20, 0.5, seed=99), known) == []
-    assert [text.split(" is ")[0] for text in unfamiliar(box(15, 20, 0.95), known)] == ["mean brightness"]
-    assert "width over height of the subject is 0.1, in training 0.5 to 1" in unfamiliar(box(2, 20, 0.5), known)
-    noisy = unfamiliar(box(15, 20, 0.5, noise=0.3), known)
+    assert describe_unfamiliar(box(15, 20, 0.5, seed=99), known) == []
+    assert [text.split(" is ")[0] for text in describe_unfamiliar(box(15, 20, 0.95), known)] == ["mean brightness"]
+    assert "width over height of the subject is 0.1, in training 0.5 to 1" in describe_unfamiliar(
+        box(2, 20, 0.5), known
+    )
+    noisy = describe_unfamiliar(box(15, 20, 0.5, noise=0.3), known)
     assert any(text.startswith("difference between neighbouring pixels") for text in noisy)
 
 
@@ -91,8 +95,8 @@ def test_an_empty_result_has_figures():
 def test_limits_let_the_asked_share_through():
     rng = np.random.default_rng(0)
     results = [dict(zip(DOUBTS, rng.exponential(size=len(DOUBTS)), strict=True)) for _ in range(400)]
-    known = limits(results, 0.05)
-    told = [doubts(one, known) for one in results]
+    known = usual_ranges(results, 0.05)
+    told = [describe_doubts(one, known) for one in results]
     assert 0.045 < np.mean([bool(words) for words in told]) <= 0.05
     # Each has its part.
     assert min(np.mean([one[name] > known[name].high for one in results]) for name in DOUBTS) > 0.02
@@ -100,8 +104,10 @@ def test_limits_let_the_asked_share_through():
 
 def test_a_doubt_is_told_with_its_figure_and_the_usual():
     known = {"outline_blur": PictureRange(0.0, 9.0), "row_mismatch": PictureRange(0.0, 0.05)}
-    assert doubts({"outline_blur": 9.0, "row_mismatch": 0.05}, known) == []
-    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.01}, known) == [
+    assert describe_doubts({"outline_blur": 9.0, "row_mismatch": 0.05}, known) == []
+    assert describe_doubts({"outline_blur": 12.34, "row_mismatch": 0.01}, known) == [
         "their outlines are blurred over 12.3 pixels, 9.0 at most is usual"
     ]
-    assert doubts({"outline_blur": 12.34, "row_mismatch": 0.5}, {}) == []  # a model that does not say what is usual
+    assert (
+        describe_doubts({"outline_blur": 12.34, "row_mismatch": 0.5}, {}) == []
+    )  # a model that does not say what is usual

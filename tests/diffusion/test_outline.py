@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
+from gdtool.diffusion.inference.outline import add_part_to_masks, draw_part, find_lost_part
 from tests.fields.shapes import cube, sphere, torus, views_of
 
 SIZE = 96
@@ -38,9 +38,9 @@ def test_a_post_that_the_guessed_views_lost_is_put_where_it_stands(seen, deep):
     front = [camera.name for camera in cameras].index("front")
     pixel = cameras[0].pixel_size
     known = np.where(guessed >= 0.5, guessed, 0)
-    part = lost_part(guessed, known, cameras, front, images["depth"][front] if deep else None)
+    part = find_lost_part(guessed, known, cameras, front, images["depth"][front] if deep else None)
     assert np.abs(part.middle - (2 - FORWARD))[part.lost].mean() < pixel
-    grown = grown_masks(part, known, cameras, front)
+    grown = add_part_to_masks(part, known, cameras, front)
     for k in range(len(cameras)):
         post = (mask[k] > 0.5) & (known[k] <= 0.5)
         assert (grown[k] >= known[k]).all()
@@ -58,13 +58,13 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
     wrong = {
         domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()
     }
-    part = lost_part(guessed, known, cameras, front, images["depth"][front])
+    part = find_lost_part(guessed, known, cameras, front, images["depth"][front])
     before = {domain: x.copy() for domain, x in wrong.items()}
     draw_part(part, wrong, known, cameras, front)
     for domain in set(wrong) - {"depth"}:
         shown = known > 0.5
         np.testing.assert_array_equal(wrong[domain][shown], before[domain][shown])
-    post = (mask[right] > 0.9) & (known[right] <= 0.5) & (grown_masks(part, known, cameras, front)[right] > 0.5)
+    post = (mask[right] > 0.9) & (known[right] <= 0.5) & (add_part_to_masks(part, known, cameras, front)[right] > 0.5)
     off = wrong["depth"][right] - images["depth"][right]
     assert post.sum() > 40
     assert np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
@@ -79,4 +79,4 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
 def test_views_that_have_room_for_all_of_the_picture_are_left_alone(solid):
     cameras, images, mask = views_of(solid, 64)
     front = [camera.name for camera in cameras].index("front")
-    assert lost_part(mask, mask, cameras, front, images["depth"][front]) is None
+    assert find_lost_part(mask, mask, cameras, front, images["depth"][front]) is None

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gdtool.diffusion.inference.paint import repainted
+from gdtool.diffusion.inference.paint import restore_albedo_contrast
 
 SIZE = 64
 
@@ -38,7 +38,7 @@ def test_contrast_that_the_model_left_half_of_comes_back(ball):
     mask, normal, light = ball
     truth = painted()
     given = washed(truth, 0.55)
-    found, share = repainted(given, truth * light[..., None], mask, normal)
+    found, share = restore_albedo_contrast(given, truth * light[..., None], mask, normal)
     assert error(found, truth, mask) < 0.35 * error(given, truth, mask)
     assert share[mask > 0].min() > 0.9
 
@@ -47,7 +47,9 @@ def test_without_normals_too(ball):
     mask, _, light = ball
     truth = painted()
     given = washed(truth, 0.55)
-    assert error(repainted(given, truth * light[..., None], mask)[0], truth, mask) < 0.6 * error(given, truth, mask)
+    assert error(restore_albedo_contrast(given, truth * light[..., None], mask)[0], truth, mask) < 0.6 * error(
+        given, truth, mask
+    )
 
 
 def test_shadows_on_one_color_stay_out(ball):
@@ -57,7 +59,7 @@ def test_shadows_on_one_color_stay_out(ball):
     shadow = np.where((x + y) % 20 < 8, 0.3, 1.0)
     color = truth * (light * shadow)[..., None]
     leaked = washed(truth * shadow[..., None], 0.2)  # a model that takes a fifth of the shadow for paint
-    found, share = repainted(leaked, color, mask, normal)
+    found, share = restore_albedo_contrast(leaked, color, mask, normal)
     assert share.max() == 0
     np.testing.assert_array_equal(found, leaked)
 
@@ -65,7 +67,7 @@ def test_shadows_on_one_color_stay_out(ball):
 def test_what_a_metal_mirrors_stays_out(ball):
     mask, normal, light = ball
     given = washed(painted(), 0.55)
-    found, share = repainted(given, painted() * light[..., None], mask, normal, np.ones_like(mask))
+    found, share = restore_albedo_contrast(given, painted() * light[..., None], mask, normal, np.ones_like(mask))
     assert share.max() == 0
     np.testing.assert_array_equal(found, given)
 
@@ -73,15 +75,15 @@ def test_what_a_metal_mirrors_stays_out(ball):
 def test_an_albedo_that_is_right_stays(ball):
     mask, normal, light = ball
     truth = painted()
-    found, _ = repainted(truth, truth * light[..., None], mask, normal)
+    found, _ = restore_albedo_contrast(truth, truth * light[..., None], mask, normal)
     assert error(found, truth, mask) < 0.02
 
 
 def test_black_white_and_empty_pictures_stay_finite(ball):
     mask, normal, _ = ball
     for color in (0.0, 1.0, 50.0):
-        found, _ = repainted(np.full((SIZE, SIZE, 3), 0.5), np.full((SIZE, SIZE, 3), color), mask, normal)
+        found, _ = restore_albedo_contrast(np.full((SIZE, SIZE, 3), 0.5), np.full((SIZE, SIZE, 3), color), mask, normal)
         assert np.isfinite(found).all()
         assert (found >= 0).all()
         assert (found <= 1).all()
-    assert repainted(painted(), painted(), np.zeros_like(mask), normal)[1].max() == 0
+    assert restore_albedo_contrast(painted(), painted(), np.zeros_like(mask), normal)[1].max() == 0

@@ -9,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model, parameter_count
-from gdtool.diffusion.reports.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
+from gdtool.diffusion.reports.plan import frozen_cost, make_plan, phase_cost, rendering_share, step_cost
 from gdtool.diffusion.training.loop import new_state, train_step
 from tests.diffusion.test_training import spheres
 
@@ -140,7 +140,7 @@ def test_a_plan_adds_up():
         steps=10,
         phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)),
     )
-    plan = plan_of(CONFIG, train)
+    plan = make_plan(CONFIG, train)
     assert plan["weights"] == parameter_count(Model(CONFIG))
     assert plan["weights_bytes"] == 20 * plan["weights"]
     assert [p["steps"] for p in plan["phases"]] == [5, 5]

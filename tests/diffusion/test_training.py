@@ -13,9 +13,9 @@ from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.data.objects import (
     LIGHTS,
     Objects,
-    draw,
+    draw_batch,
     from_bytes,
-    mirror,
+    mirror_object,
     object_order,
     permute_colors,
     to_bytes,
@@ -29,7 +29,7 @@ from gdtool.diffusion.training.loop import (
     CHECKPOINT,
     Observers,
     RunOptions,
-    choose,
+    choose_step,
     learning_rate,
     new_state,
     phase_at,
@@ -67,8 +67,8 @@ def test_bytes_keep_zero_exactly():
 def test_mirroring_swaps_sides_and_is_its_own_inverse():
     objects = spheres(1, 32)
     args = from_bytes(objects.planes[0]), from_bytes(objects.conditions[0, 0]), torch.from_numpy(objects.lights[0])
-    once = mirror(*args, MODEL.views)
-    for a, b in zip(args, mirror(*once, MODEL.views), strict=True):
+    once = mirror_object(*args, MODEL.views)
+    for a, b in zip(args, mirror_object(*once, MODEL.views), strict=True):
         torch.testing.assert_close(a, b)
     right, left = (MODEL.views.index(v) for v in ("right", "left"))
     albedo = once[0][:, PLANES["albedo"]]
@@ -105,17 +105,17 @@ def test_each_pass_shows_each_object_once():
 
 def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
     for step in range(5):
-        drawn = choose(MODEL, Phase(domains=3, views=2), 0, step)
+        drawn = choose_step(MODEL, Phase(domains=3, views=2), 0, step)
         assert drawn.domains[0] == 0
         assert len(set(drawn.domains)) == 3
         assert len(drawn.views.unique()) == 2
-    assert choose(MODEL, Phase(), 0, 0).domains == tuple(range(6))
+    assert choose_step(MODEL, Phase(), 0, 0).domains == tuple(range(6))
 
 
 def test_a_phase_may_have_a_batch_of_its_own(monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        training, "draw", lambda objects, idx, *rest: drawn.append(len(idx)) or draw(objects, idx, *rest)
+        training, "draw_batch", lambda objects, idx, *rest: drawn.append(len(idx)) or draw_batch(objects, idx, *rest)
     )
     train = msgspec.structs.replace(TRAIN, phases=(Phase(share=1.0, domains=1, views=1, batch=3),))
     training.train_step(new_state(Model(MODEL), train), spheres(), train, 0, None, "cpu")

@@ -9,7 +9,7 @@ from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.encoding import mirrored
+from gdtool.diffusion.network.encoding import mirror_images
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.unet import UNet
 
@@ -172,7 +172,7 @@ def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the
         sample_images(model, x, SamplingOptions(steps=1, guidance=guidance, mirror=True)) for x in (rgba, rgba.flip(-1))
     )
     whole, turned, apart = (torch.stack([of[d] for d in TINY.domains], 1) for of in (one, other, plain))
-    torch.testing.assert_close(mirrored(turned, tuple(range(6)), TINY.views), whole, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(mirror_images(turned, tuple(range(6)), TINY.views), whole, rtol=1e-4, atol=1e-4)
     assert float((apart - whole).abs().mean()) > 1e-3  # the network itself knows of no mirror
     two = sample_images(model, rgba[1:], SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))
     both = sample_images(model, rgba, SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))

@@ -124,11 +124,11 @@ def test_camera_embedding_verbatim():
 
 
 def test_older_names_are_read():
-    assert wonder3d.renamed("a.attn_joint_twice.to_q.weight") == "a.attn_joint_mid.to_q.weight"
-    assert wonder3d.renamed("a.norm_joint_twice.bias") == "a.norm_joint_mid.bias"
-    assert wonder3d.renamed("a.attn_joint.to_out.0.bias") == "a.attn_joint_last.to_out.0.bias"
-    assert wonder3d.renamed("a.norm_joint_mid.weight") == "a.norm_joint_mid.weight"
-    assert wonder3d.renamed("down_blocks.0.attn1.to_q.weight") == "down_blocks.0.attn1.to_q.weight"
+    assert wonder3d.translate_key("a.attn_joint_twice.to_q.weight") == "a.attn_joint_mid.to_q.weight"
+    assert wonder3d.translate_key("a.norm_joint_twice.bias") == "a.norm_joint_mid.bias"
+    assert wonder3d.translate_key("a.attn_joint.to_out.0.bias") == "a.attn_joint_last.to_out.0.bias"
+    assert wonder3d.translate_key("a.norm_joint_mid.weight") == "a.norm_joint_mid.weight"
+    assert wonder3d.translate_key("down_blocks.0.attn1.to_q.weight") == "down_blocks.0.attn1.to_q.weight"
 
 
 def test_white_background_of_normals_becomes_coverage():

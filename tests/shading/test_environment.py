@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.shading.lights.bundled import BUNDLED, direction, paint, random_lobes
+from gdtool.shading.lights.bundled import BUNDLED, direction, random_lobes, rasterise_lobes
 from gdtool.shading.lights.environment import METERED_WHITE, Environment
 from gdtool.shading.lights.load import load_environment
 from gdtool.shading.lights.prefilter import IrradianceMap
@@ -66,7 +66,7 @@ def test_bundled_lights_are_metered_and_fitted(name):
 
 def test_a_light_made_of_lobes_is_found_again():
     axes = np.stack([direction(30, 40), direction(-100, 10)])
-    env = paint(axes, np.array([20.0, 4.0]), np.array([[3.0, 2, 1], [0.5, 0.5, 1]]), 32)
+    env = rasterise_lobes(axes, np.array([20.0, 4.0]), np.array([[3.0, 2, 1], [0.5, 0.5, 1]]), 32)
     lobes, error = fit_sg(env)
     assert error["radiance_rms"] < 0.1
     assert error["irradiance_rms"] < 0.02

@@ -53,7 +53,7 @@ def test_pyramid_keeps_the_mean():
     [(0.2, 128, 0, 0.08), (0.3, 64, 64, 0.06), (0.5, 32, 32, 0.06), (1.0, 32, 32, 0.06)],
 )
 def test_filtered_light_is_the_lobes_average(roughness, side, dense, tolerance):
-    env = studio("mid", fit=False)[0].shrunk(64)
+    env = studio("mid", fit=False)[0].downsampled(64)
     light = (env.image * env.solid_angles[:, None, None]).reshape(-1, 3)
     toward, weight = env.directions.reshape(-1, 3), np.repeat(env.solid_angles, env.image.shape[1])
     normal = octahedral_directions(8)

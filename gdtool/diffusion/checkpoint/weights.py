@@ -51,10 +51,10 @@ def read_config(path: Path) -> ModelConfig:
     """Read a model folder's config.json. Raises InputError that names the wrong field and its bound."""
     if not path.exists():
         raise InputError(path, "does not exist", NO_MODEL)
-    return configured(read_json(path), path)
+    return parse_config(read_json(path), path)
 
 
-def configured(fields: object, subject: object) -> ModelConfig:
+def parse_config(fields: object, subject: object) -> ModelConfig:
     """Convert parsed JSON to a ModelConfig.
 
     subject: the file or folder that an error names. Raises InputError that names the wrong field and its bound.
@@ -67,7 +67,7 @@ def configured(fields: object, subject: object) -> ModelConfig:
         ) from None
 
 
-def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
+def require_model_fits(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
     """Build the network on PyTorch's meta device, which holds shapes and no values, and check that its weights fit.
 
     bytes_per_weight: bytes of memory held for each weight, for example BYTES_TO_LOAD. subject: the file or folder that
@@ -86,7 +86,7 @@ def load_model(folder: Path) -> Model:
     for the weights is allocated only after the configuration and the file have been checked against each other.
     """
     config = read_config(folder / "config.json")
-    wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
+    wanted = require_model_fits(config, BYTES_TO_LOAD, folder).state_dict()
     tensors, _ = read_tensors(folder / WEIGHTS)
     check_shapes(folder / WEIGHTS, tensors, wanted)
     model = Model(config)

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from gdtool.core.errors import InputError
 from gdtool.core.reading import read_json
-from gdtool.diffusion.checkpoint.weights import BYTES_TO_LOAD, check_shapes, configured, require_room
+from gdtool.diffusion.checkpoint.weights import BYTES_TO_LOAD, check_shapes, parse_config, require_model_fits
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 from gdtool.diffusion.network.model import Model
@@ -26,7 +26,7 @@ from gdtool.diffusion.network.tensors import read_tensors
 EXTENT = 192 / 256
 UNET = "unet/diffusion_pytorch_model.safetensors"
 NEAREST_NORMAL = 3**0.5 - 1  # from white (1, 1, 1), encoded, to the nearest unit normal
-LEGACY = (
+OLDER_KEYS = (
     (".attn_joint_twice.", ".attn_joint_mid."),
     (".norm_joint_twice.", ".norm_joint_mid."),
     (".attn_joint.", ".attn_joint_last."),
@@ -65,9 +65,9 @@ def recognises(folder: Path) -> bool:
     return (folder / "unet" / "config.json").is_file()
 
 
-def renamed(name: str) -> str:
+def translate_key(name: str) -> str:
     """Translate a key of the published weights, in the older spelling or the newer one, to a key of this network."""
-    for old, new in LEGACY:
+    for old, new in OLDER_KEYS:
         name = name.replace(old, new)
     return name
 
@@ -93,7 +93,7 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
             raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
     if not isinstance(unet.attention_head_dim, int):
         raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
-    return configured(
+    return parse_config(
         {
             "image_size": 8 * unet.sample_size,
             "domains": ("color", "normal"),
@@ -146,9 +146,9 @@ def load(folder: Path):
     for part, name in (("vae", "diffusion_pytorch_model"), ("image_encoder", "model")):
         # A pickle or a damaged file is named before a library opens it.
         read_tensors(folder / part / f"{name}.safetensors")
-    tensors = {renamed(name): tensor.float() for name, tensor in tensors.items()}
+    tensors = {translate_key(name): tensor.float() for name, tensor in tensors.items()}
     config = read_config(folder, tensors)
-    check_shapes(folder / UNET, tensors, require_room(config, BYTES_TO_LOAD, folder).unet.state_dict())
+    check_shapes(folder / UNET, tensors, require_model_fits(config, BYTES_TO_LOAD, folder).unet.state_dict())
     model = Model(config)
     model.unet.load_state_dict(tensors)
     return model.eval().requires_grad_(False)

@@ -44,7 +44,7 @@ _EXTENDED = (
 _BLOCK = 1 << 20  # bytes copied at a time
 
 
-def placed(member: str) -> tuple[str, str]:
+def split_member_name(member: str) -> tuple[str, str]:
     """Split a member's name into the name of its object and the path inside that object's views folder."""
     path = PurePosixPath(member)
     key, _, extension = path.name.partition(".")
@@ -62,14 +62,14 @@ def object_count(archive: Path) -> int:
     ResourceError for more than MAX_MEMBERS members, or for an archive that would unpack to more than MAX_RATIO times
     its size.
     """
-    with _opened_tar(archive) as tar:
-        count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
+    with _open_tar(archive) as tar:
+        count = sum(split_member_name(member.name)[1] == MANIFEST for member in _members(archive, tar))
     if not count:
         raise InputError(archive, "holds no views folder", "pack what render-dataset writes")
     return count
 
 
-def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
+def unpack_views(archive: Path, workspace: Path) -> Iterator[Folder]:
     """Unpack the views folders of a .tar under workspace, one after another; each is removed before the next.
 
     An object's members must follow each other, as tar and WebDataset write them. Each header is checked before its
@@ -78,13 +78,13 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
     """
     root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
     try:
-        with _opened_tar(archive) as tar:
+        with _open_tar(archive) as tar:
             current = None
             for member in _members(archive, tar):
-                name, relative = placed(member.name)
+                name, relative = split_member_name(member.name)
                 if name != current:
                     if current is not None:
-                        yield _opened(archive, root, current)
+                        yield _open_object(archive, root, current)
                     shutil.rmtree(root)
                     root.mkdir()
                     current, count, size = name, 0, 0
@@ -96,10 +96,12 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
                         f"for {shown(name)}",
                         "render fewer or smaller views of one object",
                     )
-                target = path_inside(_place(root, name, archive), relative, archive, "member", byte_escapes=True)
+                target = path_inside(
+                    _object_folder(root, name, archive), relative, archive, "member", byte_escapes=True
+                )
                 _unpack(archive, tar, member, target)
             if current is not None:
-                yield _opened(archive, root, current)
+                yield _open_object(archive, root, current)
     finally:
         shutil.rmtree(root, ignore_errors=True)
 
@@ -122,7 +124,7 @@ class _BoundedHeader(tarfile.TarInfo):
 
 
 @contextmanager
-def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
+def _open_tar(archive: Path) -> Iterator[tarfile.TarFile]:
     """Open a tar for reading. Raises InputError where it is none."""
     require_regular_file(archive)
     try:
@@ -130,14 +132,14 @@ def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
     except OSError as error:
         raise from_os_error(error, archive) from None
     with file:
-        with _malformed(archive):
+        with _as_input_error(archive):
             tar = tarfile.open(fileobj=file, tarinfo=_BoundedHeader)  # noqa: SIM115 - closed by `with tar` below
         with tar:
             yield tar
 
 
 @contextmanager
-def _malformed(archive: Path) -> Iterator[None]:
+def _as_input_error(archive: Path) -> Iterator[None]:
     """Convert the errors of tarfile and of the decompressors, for bytes that are no tar, to InputError."""
     try:
         yield
@@ -163,7 +165,7 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
     """Yield the regular files of an archive. Each header's name, kind and sizes are checked first."""
     packed, count, size = max(archive.stat().st_size, 1), 0, 0
     while True:
-        with _malformed(archive):
+        with _as_input_error(archive):
             member = tar.next()
         if member is None:
             return
@@ -200,11 +202,11 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
             raise InputError(archive, f"holds {shown(member.name)} both as a file and as a folder", _PACK) from None
         raise from_os_error(error, target) from None
     with out:
-        with _malformed(archive):
+        with _as_input_error(archive):
             source: BinaryIO = tar.extractfile(member)
         left = member.size
         while left:
-            with _malformed(archive):
+            with _as_input_error(archive):
                 block = source.read(min(left, _BLOCK))
             if not block:
                 raise InputError(archive, f"is not a whole tar file (it ends within {shown(member.name)})", _PACK)
@@ -215,7 +217,7 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
             left -= len(block)
 
 
-def _place(root: Path, name: str, archive: Path) -> Path:
+def _object_folder(root: Path, name: str, archive: Path) -> Path:
     """Return the folder under root that an object is unpacked into. Its parent is named after the object."""
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
@@ -224,9 +226,9 @@ def _place(root: Path, name: str, archive: Path) -> Path:
     return root / safe / "views"
 
 
-def _opened(archive: Path, root: Path, name: str) -> Folder:
+def _open_object(archive: Path, root: Path, name: str) -> Folder:
     """Open an unpacked views folder. Raises InputError where its manifest is missing."""
-    folder = _place(root, name, archive)
+    folder = _object_folder(root, name, archive)
     if not (folder / MANIFEST).is_file():
         raise InputError(
             archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one"

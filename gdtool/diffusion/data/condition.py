@@ -34,14 +34,14 @@ class PictureOptions:
     size: int
 
 
-def wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
+def mask_size_error(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
     """Make the error for a mask whose size (width, height) is not the picture's."""
     return InputError(
         mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}"
     )
 
 
-def condition_of(
+def make_condition(
     path: Path, name: str, options: PictureOptions, warn: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Read a picture, cut its subject out and frame it, at the model's size and at about the picture's resolution.
@@ -59,7 +59,7 @@ def condition_of(
         )
     mask = read_image(Path(options.mask)) if options.mask is not None else None
     if mask is not None and mask.shape[:2] != image.shape[:2]:
-        raise wrong_size(options.mask, mask.shape[1::-1], image.shape[1::-1])
+        raise mask_size_error(options.mask, mask.shape[1::-1], image.shape[1::-1])
     alpha = foreground(image, mask, path, warn, options.matting)
     if not (alpha > 0.5).any():
         raise InputError(path, "shows no subject: its mask is empty", "give one with --mask")
@@ -84,13 +84,13 @@ def condition_of(
     return condition, picture
 
 
-def extent_of(convention: str) -> float:
+def trained_extent(convention: str) -> float:
     """Return the longest side of the framed subject, as a share of the image, that a model was trained with."""
     from gdtool.diffusion.checkpoint import wonder3d
 
     return wonder3d.EXTENT if convention == "wonder3d" else FRONT_EXTENT
 
 
-def encoded_rgba(image: np.ndarray) -> np.ndarray:
+def encode_rgba(image: np.ndarray) -> np.ndarray:
     """Encode the linear color of (h, w, 4) to sRGB, clipped to [0, 1]. Alpha is clipped only."""
     return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)

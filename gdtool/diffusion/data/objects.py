@@ -208,7 +208,7 @@ def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
-def draw(
+def draw_batch(
     objects: Objects,
     idx: np.ndarray,
     config: ModelConfig,
@@ -229,7 +229,7 @@ def draw(
             torch.from_numpy(np.array(objects.lights[i])),
         )
         if train.mirror and generator.random() < 0.5:
-            sample = mirror(*sample, config.views)
+            sample = mirror_object(*sample, config.views)
         if train.hue:
             sample = permute_colors(*sample, generator.permutation(3))
         for out, value in zip((planes, rgba, lights), sample, strict=True):
@@ -237,7 +237,7 @@ def draw(
     return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
 
 
-def mirror(planes, rgba, light, views: tuple[str, ...]):
+def mirror_object(planes, rgba, light, views: tuple[str, ...]):
     """Mirror one object about the plane x = 0.
 
     Takes planes (k, 13, h, w), rgba (4, h, w), light (16, 7) and the views' names. Left and right views are exchanged;
@@ -267,6 +267,6 @@ def permute_colors(planes, rgba, light, order):
     return planes, rgba, light
 
 
-def to_tensor_condition(image: np.ndarray) -> torch.Tensor:
+def condition_batch(image: np.ndarray) -> torch.Tensor:
     """Encode one framed image (h, w, 4), linear color and straight alpha, as a batch (1, 4, h, w) in [-1, 1]."""
     return torch.from_numpy(condition_plane(image)).unsqueeze(0)

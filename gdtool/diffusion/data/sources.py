@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gdtool.core.folder import Folder, dataset_objects
-from gdtool.diffusion.data.archives import object_count, views_of
+from gdtool.diffusion.data.archives import object_count, unpack_views
 
 
 def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator[Folder]:
@@ -15,7 +15,7 @@ def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator
     parts = []
     for source in sources:
         if isinstance(source, Path):
-            parts.append(views_of(source, workspace))
+            parts.append(unpack_views(source, workspace))
         else:
             parts.append([source] if source.kind == "views" else dataset_objects(source))
     return itertools.chain.from_iterable(parts)

@@ -69,7 +69,7 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
     }
 
 
-def ranges(conditions) -> dict[str, PictureRange]:
+def figure_ranges(conditions) -> dict[str, PictureRange]:
     """Compute the range of each figure of picture_figures() over an iterable of conditions (4, h, w)."""
     every = [picture_figures(np.asarray(figures, np.float32)) for figures in conditions]
     names = list(dict.fromkeys(name for figures in every for name in figures))
@@ -77,7 +77,7 @@ def ranges(conditions) -> dict[str, PictureRange]:
     return {name: PictureRange(*(float(np.quantile(x, q)) for q in (TAIL, 1 - TAIL))) for name, x in columns.items()}
 
 
-def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
+def describe_unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
     """List descriptions of the figures of a condition (4, h, w) that lie outside their range in training.
 
     known: the range of each figure by name. A figure without a range is not checked.
@@ -116,7 +116,7 @@ def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.nda
     return out
 
 
-def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
+def usual_ranges(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
     """Compute the usual range of each figure of result_figures() from the figures of many results.
 
     The upper ends are quantiles, the same for each figure. It is the lowest quantile for which at most the share
@@ -130,7 +130,7 @@ def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureR
     return {name: PictureRange(0.0, float(value)) for name, value in zip(DOUBTS, high, strict=True)}
 
 
-def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
+def describe_doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
     """List descriptions of the figures of a result that lie above their usual range, by name in `known`."""
     return [
         words.format(result[name], known[name].high)

@@ -27,7 +27,7 @@ LEAST_FACING = 0.2  # cosine: least facing of a normal that is drawn
 
 
 @dataclass(frozen=True)
-class Part:
+class LostPart:
     """Hold the n pixels of a lost part in the view whose outline is known.
 
     row, column (n,): the pixels. middle (n,): depth of the part's middle, in world units. half (n,): half its
@@ -43,9 +43,9 @@ class Part:
     lost: np.ndarray
 
 
-def lost_part(
+def find_lost_part(
     soft: np.ndarray, mask: np.ndarray, cameras: list[Camera], known: int, depth: np.ndarray | None
-) -> Part | None:
+) -> LostPart | None:
     """Find the pixels of the known view behind which the other masks leave no space; None where there are none.
 
     Args:
@@ -90,22 +90,24 @@ def lost_part(
     at = np.nonzero(zone)
     down, right = np.gradient(gaussian_filter(within, 1.0))
     outward = down[at][:, None] * camera.world_from_camera[:3, 1] - right[at][:, None] * camera.world_from_camera[:3, 0]
-    return Part(
+    return LostPart(
         *at, middle[at], half[at], outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9), lost[at]
     )
 
 
-def grown_masks(part: Part, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
+def add_part_to_masks(part: LostPart, mask: np.ndarray, cameras: list[Camera], known: int) -> np.ndarray:
     """Add the part to a copy of the masks (k, h, w), except to that of the view with index `known`."""
     out = mask.copy()
     for k in range(len(cameras)):
         if k != known:
-            row, column, *_ = _shown(part, mask.shape[1:], cameras, known, k)
+            row, column, *_ = _project_part(part, mask.shape[1:], cameras, known, k)
             out[k][row, column] = 1.0
     return out
 
 
-def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int) -> None:
+def draw_part(
+    part: LostPart, images: dict[str, np.ndarray], mask: np.ndarray, cameras: list[Camera], known: int
+) -> None:
     """Draw the part into the images (k, h, w[, c]) of all domains, in place.
 
     Its colors and materials are those of the known view. Its depth is computed for each view, and its normals are those
@@ -113,7 +115,7 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
     """
     known_values = {domain: image[known].copy() for domain, image in images.items()}
     for k in range(len(cameras)):
-        row, column, depth, normal, source = _shown(part, mask.shape[1:], cameras, known, k)
+        row, column, depth, normal, source = _project_part(part, mask.shape[1:], cameras, known, k)
         put = part.lost[source] if k == known else mask[k][row, column] <= 0.5
         if k != known and "depth" in images:
             put |= images["depth"][k][row, column] > depth
@@ -127,7 +129,9 @@ def draw_part(part: Part, images: dict[str, np.ndarray], mask: np.ndarray, camer
                 image[k][row[fresh], column[fresh]] = drawn[fresh]
 
 
-def _shown(part: Part, shape: tuple[int, int], cameras: list[Camera], known: int, k: int) -> tuple[np.ndarray, ...]:
+def _project_part(
+    part: LostPart, shape: tuple[int, int], cameras: list[Camera], known: int, k: int
+) -> tuple[np.ndarray, ...]:
     """Project the part into view k, and keep the point nearest to the camera in each pixel.
 
     shape: (h, w) of the views. Returns, for m pixels: row (m,), column (m,), depth (m,), unit normal (m, 3), and the

@@ -20,7 +20,7 @@ LIGHT, PAINT = 0.3, 0.5
 WIDTH, LEAST = 6.0, 0.005
 
 
-def repainted(
+def restore_albedo_contrast(
     albedo: np.ndarray,
     color: np.ndarray,
     mask: np.ndarray,

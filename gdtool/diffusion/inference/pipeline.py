@@ -9,9 +9,9 @@ import torch
 
 from gdtool.core.stage import Output
 from gdtool.diffusion.config import ModelConfig
-from gdtool.diffusion.data.objects import to_tensor_condition
+from gdtool.diffusion.data.objects import condition_batch
 from gdtool.diffusion.inference.compiled import sample_compiled
-from gdtool.diffusion.inference.familiarity import doubts, read_ranges, unfamiliar
+from gdtool.diffusion.inference.familiarity import describe_doubts, describe_unfamiliar, read_ranges
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.model import Model
 
@@ -30,8 +30,8 @@ def sample_condition(
     ranges_folder: model folder with the ranges of the training pictures; a picture outside them brings a warning.
     compiled: whether to compile the network first. name: the picture's name in warnings.
     """
-    rgba = to_tensor_condition(condition)
-    strange = unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
+    rgba = condition_batch(condition)
+    strange = describe_unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
     if strange:
         out.warn(f"{name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
     # The memory order that convolutions work in; a twentieth quicker, the same to rounding.
@@ -43,7 +43,7 @@ def sample_condition(
     return images
 
 
-def tell_doubts(
+def warn_of_doubts(
     ranges_folder: Path,
     report: dict[str, float],
     config: ModelConfig,
@@ -68,7 +68,7 @@ def tell_doubts(
             "what is usual is known of the model's own steps, without guidance, in all domains",
         )
         return
-    unsure = doubts(report, read_ranges(ranges_folder))
+    unsure = describe_doubts(report, read_ranges(ranges_folder))
     if unsure:
         out.warn(
             f"{name}: the model is unsure of the views that the picture does not show ({'; '.join(unsure)}): "

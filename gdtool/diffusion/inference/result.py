@@ -7,8 +7,8 @@ import torch
 
 from gdtool.cameras import Camera, backproject, project
 from gdtool.diffusion.inference.familiarity import result_figures
-from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
-from gdtool.diffusion.inference.paint import repainted
+from gdtool.diffusion.inference.outline import add_part_to_masks, draw_part, find_lost_part
+from gdtool.diffusion.inference.paint import restore_albedo_contrast
 from gdtool.diffusion.network.encoding import coverage, decode
 from gdtool.folders.views import Views
 
@@ -17,7 +17,7 @@ from gdtool.folders.views import Views
 OUTLINE = 0.45
 # Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out
 # objects; edges stay soft.
-DECIDED = 4
+METALLIC_POWER = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
@@ -28,16 +28,16 @@ def sharpen(mask: torch.Tensor) -> torch.Tensor:
     return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
 
 
-def decided(metallic: torch.Tensor) -> torch.Tensor:
-    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer, by raising its odds to the power DECIDED.
+def sharpen_metallic(metallic: torch.Tensor) -> torch.Tensor:
+    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer, by raising its odds to the power METALLIC_POWER.
 
     A material is a metal or it is none. A sampled value in between says how sure the model is.
     """
-    yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
+    yes, no = metallic**METALLIC_POWER, (1 - metallic) ** METALLIC_POWER
     return yes / (yes + no)
 
 
-def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
+def average_opposite_views(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     """Average the coverage (k, h, w) of orthographic views from opposite sides, whose outlines are mirror images."""
     out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
     for k, camera in enumerate(cameras):
@@ -49,7 +49,7 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     return out
 
 
-def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+def move_depth_within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
     """Move depth (k, h, w) so that no point projects outside the outline of another view.
 
     mask (k, h, w) is the views' coverage, 0 to 1. A point moves along its ray, between the camera's near and far plane.
@@ -75,7 +75,7 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
             ):
                 continue
             shown = (mask[j] > 0.5).any(1)
-            first, last = _begin(mask[j]), width - _begin(mask[j][:, ::-1])
+            first, last = _first_covered_column(mask[j]), width - _first_covered_column(mask[j][:, ::-1])
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
             lacking = np.clip(column, first[:, None], last[:, None]) - column
             out[k] += np.where(inside & shown[:, None], lacking / per_depth, 0.0)
@@ -84,7 +84,7 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
     return out.astype(np.float32)
 
 
-def _begin(mask: np.ndarray) -> np.ndarray:
+def _first_covered_column(mask: np.ndarray) -> np.ndarray:
     """Find the column (h,) at which the coverage (h, w) of each row first reaches one half.
 
     Interpolates between pixel centres; pixel i covers i to i + 1. Returns 0 for a row that stays below one half.
@@ -120,7 +120,7 @@ def views_from_images(
     from gdtool.images.color import linear_from_srgb
 
     soft = coverage(images, background)
-    mask = sharpen(tied(soft, cameras)).numpy()
+    mask = sharpen(average_opposite_views(soft, cameras)).numpy()
     values = decode(images, soft, background)
     if picture_alpha is not None:
         known = np.ascontiguousarray(picture_alpha, np.float32)
@@ -136,11 +136,11 @@ def views_from_images(
     part, before, names = None, mask, [camera.name for camera in cameras]
     front = names.index("front") if picture_alpha is not None and "front" in names else None
     if front is not None:
-        part = lost_part(
+        part = find_lost_part(
             soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None
         )
     if part is not None:
-        mask = grown_masks(part, mask, cameras, front)
+        mask = add_part_to_masks(part, mask, cameras, front)
     out = {}
     for domain in images:
         if domain not in domains:
@@ -151,16 +151,18 @@ def views_from_images(
         elif domain == "normal":
             value = np.moveaxis(value, 1, -1)
         elif domain == "metallic":
-            value = decided(values[domain]).numpy()
+            value = sharpen_metallic(values[domain]).numpy()
         if domain == "depth":
-            value = within_silhouettes(value, mask, cameras)
+            value = move_depth_within_silhouettes(value, mask, cameras)
         inside = mask > 0
         out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
     report = {"drawn_share": 0.0, "painted_share": 0.0} | result_figures(soft.numpy(), front, picture_alpha)
     if front is not None and "albedo" in out and "color" in values:
         color = linear_from_srgb(np.moveaxis(values["color"][front].numpy(), 0, -1))
         normal, metallic = (out[domain][front] if domain in out else None for domain in ("normal", "metallic"))
-        out["albedo"][front], share = repainted(out["albedo"][front], color, mask[front], normal, metallic)
+        out["albedo"][front], share = restore_albedo_contrast(
+            out["albedo"][front], color, mask[front], normal, metallic
+        )
         report["painted_share"] = float((share * mask[front]).sum() / max(mask[front].sum(), 1.0))
     if part is not None:
         draw_part(part, out, before, cameras, front)

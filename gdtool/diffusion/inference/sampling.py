@@ -12,7 +12,7 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
+from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirror_images
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import sample
 
@@ -60,7 +60,7 @@ def sample_images(
     object's views do not depend on the rest of the batch.
     """
     config, device = model.config, rgba.device
-    mirror = _mirrors(config, options)
+    mirror = _averages_mirror_image(config, options)
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in options.domains]
@@ -75,7 +75,7 @@ def sample_images(
     def mirror_latents(latents):
         """Mirror latents (n, c, h, w) of whole objects about x = 0: decode, mirror, encode."""
         images = model.codec.decode(latents).unflatten(0, (-1, len(indices), len(views)))
-        return model.codec.encode(mirrored(images, indices, config.views).flatten(0, 2))
+        return model.codec.encode(mirror_images(images, indices, config.views).flatten(0, 2))
 
     def with_mirror_images(latents):
         """Append the latents of the mirrored images to latents (n, c, h, w), which gives (2 n, c, h, w)."""
@@ -103,10 +103,12 @@ def sample_images(
         """Predict x_0 from x (n, c, h, w) at timestep t; i is the step's number."""
         next(bar, None)
         both = guided and options.guided_from <= t / (config.timesteps - 1) <= options.guided_to
-        seen, told, layout = double if both else (condition, context, single)
+        condition_in, context_in, layout = double if both else (condition, context, single)
         times = torch.full((layout.objects,), t, device=device)
         with precision_context(device, options.precision):
-            clean = model.predict_clean(x.repeat(2, 1, 1, 1) if both else x, seen, times, told, layout, views)
+            clean = model.predict_clean(
+                x.repeat(2, 1, 1, 1) if both else x, condition_in, times, context_in, layout, views
+            )
         if both:
             with_condition, without = clean.chunk(2)
             clean = without + options.guidance * (with_condition - without)
@@ -124,7 +126,7 @@ def sample_images(
     return {d: images[:, j] for j, d in enumerate(wanted)}
 
 
-def _mirrors(config: ModelConfig, options: SamplingOptions) -> bool:
+def _averages_mirror_image(config: ModelConfig, options: SamplingOptions) -> bool:
     """Decide whether to average with the mirrored picture. Raises InputError where it is required and impossible."""
     possible = (
         config.codec == "patch"

@@ -114,16 +114,16 @@ class CrossDomainAttention(Attention):
         out[color] = self.to_out[0](fused)
         if self.two_way:
             keys, values = self.split(self.to_k(color_tokens)), self.split(self.to_v(color_tokens))
-            heard = attend(
+            from_color = attend(
                 self.split(self.to_q(rest)),
                 keys.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
                 values.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
             )
-            heard = self.to_out[0](self.join(heard))
+            from_color = self.to_out[0](self.join(from_color))
         else:
-            heard = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
+            from_color = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
         for j, i in enumerate(others):
-            out[i] = heard[:, j]
+            out[i] = from_color[:, j]
         return torch.stack(out, 1).flatten(0, 2)
 
 

@@ -85,7 +85,7 @@ def mirrored_order(views: tuple[str, ...]) -> list[int]:
     return [views.index(MIRRORED_VIEW.get(name, name)) for name in views]
 
 
-def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
+def mirror_images(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
     """Mirror encoded images (b, d, k, 3, h, w) of objects about x = 0. Applied twice, it gives the input.
 
     domains: indices into DOMAINS along d. views: names along k.

@@ -17,7 +17,7 @@ from gdtool.core.errors import InputError
 from gdtool.diffusion.config import ModelConfig
 
 
-def resized(config: ModelConfig, size: int) -> ModelConfig:
+def resize_config(config: ModelConfig, size: int) -> ModelConfig:
     """Return the configuration for images of `size` pixels a side, with patches that keep the number of tokens.
 
     Raises InputError for a size at which a patch has no whole number of pixels or the network cannot be built.
@@ -48,7 +48,7 @@ def resized(config: ModelConfig, size: int) -> ModelConfig:
         ) from None
 
 
-def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
+def grow_weights(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
     """Convert the weights of `small` to those of `large`, the same configuration at a multiple of its size.
 
     The weight of a pixel that is read is divided among the pixels of its square; the weight of a pixel that is written
@@ -57,7 +57,7 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
     """
     if small.image_size == large.image_size:
         return tensors
-    if small.codec != "patch" or large.image_size % small.image_size or resized(small, large.image_size) != large:
+    if small.codec != "patch" or large.image_size % small.image_size or resize_config(small, large.image_size) != large:
         raise InputError(
             "start",
             f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
@@ -66,16 +66,16 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
         )
     factor = large.image_size // small.image_size
     out = dict(tensors)
-    out["unet.conv_in.weight"] = _squares(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2
+    out["unet.conv_in.weight"] = _repeat_pixels(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2
     for name in ("unet.conv_out.weight", "unet.conv_out.bias"):
-        out[name] = _squares(tensors[name], 0, small.patch, factor)
+        out[name] = _repeat_pixels(tensors[name], 0, small.patch, factor)
     if small.encoder == "patch":
         name = "encoder.embed.weight"
-        out[name] = _squares(tensors[name], 1, small.encoder_patch, factor) / factor**2
+        out[name] = _repeat_pixels(tensors[name], 1, small.encoder_patch, factor) / factor**2
     return out
 
 
-def _squares(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
+def _repeat_pixels(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
     """Repeat each pixel of a patch to factor x factor pixels, in a weight whose dimension dim holds folded patches.
 
     That dimension has c patch² entries, in the order of torch's pixel_unshuffle.

@@ -161,15 +161,15 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
             codec = VaeCodec(config, frozen_part(config, "vae"))
             shape = (CHUNK, 4, codec.side, codec.side)
             images = torch.zeros(CHUNK, 3, config.image_size, config.image_size, device="meta")
-            cost["encode"], cost["encode_bytes"] = _counted(lambda: codec.encode(images))
-            cost["decode"], cost["decode_bytes"] = _counted(
+            cost["encode"], cost["encode_bytes"] = _measure_call(lambda: codec.encode(images))
+            cost["decode"], cost["decode_bytes"] = _measure_call(
                 lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward()
             )
             cost["encode"], cost["decode"] = cost["encode"] / CHUNK, cost["decode"] / CHUNK
             cost["weights_bytes"] += 4.0 * parameter_count(codec.vae)
         if config.encoder == "clip":
             clip = frozen_part(config, "image_encoder").requires_grad_(False)
-            cost["object"], _ = _counted(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
+            cost["object"], _ = _measure_call(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
             cost["weights_bytes"] += 4.0 * parameter_count(clip)
     except ImportError:
         return None
@@ -211,7 +211,7 @@ def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
         )
 
 
-def _counted(call) -> tuple[float, float]:
+def _measure_call(call) -> tuple[float, float]:
     """Measure the FLOPs and the peak bytes of call(), which is run twice."""
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     with counter:
@@ -271,7 +271,7 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
     )
 
 
-def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
+def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
     """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
     weights = parameter_count(structure(config))
     frozen = frozen_cost(config)
@@ -350,8 +350,8 @@ def phase_cost(
     }
 
 
-def text_of(report: dict) -> str:
-    """Format the report of plan_of() as lines for a terminal."""
+def format_plan(report: dict) -> str:
+    """Format the report of make_plan() as lines for a terminal."""
     lines = [
         f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB "
         "with gradients, moments and average",

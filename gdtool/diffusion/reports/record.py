@@ -13,7 +13,7 @@ from gdtool.diffusion.data.objects import Objects, from_bytes
 from gdtool.diffusion.inference import familiarity
 from gdtool.diffusion.network.model import parameter_count
 from gdtool.diffusion.reports.curve import draw_curve
-from gdtool.diffusion.reports.report import append_validation, card, validation
+from gdtool.diffusion.reports.report import append_validation, model_card, validation
 from gdtool.diffusion.training import distributed
 from gdtool.diffusion.training.loop import Observers, State
 from gdtool.diffusion.training.tensorboard import Events
@@ -32,16 +32,16 @@ class Recorder:
     precision: of the network when it samples, "float32" or "bfloat16". tensorboard: whether to write events.
     """
 
-    def __init__(self, workspace: Path, shown: Objects, precision: str, tensorboard: bool):
-        self.workspace, self.shown, self.precision = workspace, shown, precision
+    def __init__(self, workspace: Path, held_out: Objects, precision: str, tensorboard: bool):
+        self.workspace, self.held_out, self.precision = workspace, held_out, precision
         (workspace / "validation").mkdir(exist_ok=True)
         self.events = Events(workspace / "tensorboard") if tensorboard else None
 
     def validate(self, state: State) -> None:
         """Sample the held-out objects, if there are any."""
-        if not len(self.shown):
+        if not len(self.held_out):
             return
-        grid, psnr = validation(state, self.shown, self.precision)
+        grid, psnr = validation(state, self.held_out, self.precision)
         write_png(self.workspace / "validation" / f"step_{state.step:06d}.png", grid)
         append_validation(self.workspace / "validation.csv", state.step, state.seconds, psnr)
         if self.events is not None:
@@ -60,7 +60,7 @@ class Recorder:
                 shutil.copyfile(file, out.path(f"tensorboard/{file.name}"))
         shutil.copyfile(self.workspace / "loss.csv", out.path("loss.csv"))
         write_png(out.path("loss.png"), draw_curve(self.workspace / "loss.csv"))
-        if len(self.shown):
+        if len(self.held_out):
             shutil.copyfile(self.workspace / "validation.csv", out.path("validation.csv"))
         for picture in sorted((self.workspace / "validation").glob("*.png")):
             shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
@@ -81,7 +81,7 @@ def write_results(
         for i in every
         for k in range(min(PICTURES_EACH, objects.conditions.shape[1]))
     )
-    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.ranges(pictures))
+    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.figure_ranges(pictures))
     facts = {
         "objects": order.used,
         "steps": state.step,
@@ -93,7 +93,7 @@ def write_results(
         "processes": distributed.size(),
         "ablation": ablation,
     }
-    out.path("card.md").write_text(card(preset, order.model, order.train, facts))
+    out.path("card.md").write_text(model_card(preset, order.model, order.train, facts))
     out.content = ModelContent(
         preset=preset,
         image_size=order.model.image_size,

@@ -85,7 +85,7 @@ def machine() -> str:
     return f"{model or platform.processor()}, {os.cpu_count()} cores"
 
 
-def card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> str:
+def model_card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> str:
     """Write the model card in Markdown: purpose, training data and procedure, and the whole configuration."""
     configuration = msgspec.json.format(msgspec.json.encode({"model": model, "train": train}), indent=1).decode()
     table = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in facts.items())

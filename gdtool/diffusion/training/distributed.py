@@ -77,12 +77,12 @@ def receive() -> Any:
     return order[0]
 
 
-def share_of(part: np.ndarray) -> np.ndarray:
+def part_for_process(part: np.ndarray) -> np.ndarray:
     """Return this process's part of an array (n, …), about n over the number of processes."""
     return np.array_split(part, size())[rank()]
 
 
-def total(figures: dict[str, float]) -> dict[str, float]:
+def sum_over_processes(figures: dict[str, float]) -> dict[str, float]:
     """Sum figures by name over all processes. A process that lacks a name counts as 0."""
     if size() == 1:
         return figures
@@ -124,7 +124,7 @@ def is_sharded(model: nn.Module) -> bool:
     return any(hasattr(p, "full_tensor") for p in model.parameters())
 
 
-def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
+def local_part(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
     """Return this process's part of a tensor that FSDP2 has split, or with `whole` all of it; detached."""
     x = x.detach()
     if not hasattr(x, "to_local"):
@@ -132,7 +132,7 @@ def local(x: torch.Tensor, whole: bool = False) -> torch.Tensor:
     return x.full_tensor() if whole else x.to_local()
 
 
-def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
+def gather(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
     """Gather a tensor that is split over the processes.
 
     x is a DTensor, or this process's part of a tensor that is split in the same way as the DTensor `like`.
@@ -144,7 +144,7 @@ def whole(x: torch.Tensor, like: torch.Tensor | None = None) -> torch.Tensor:
     return x.full_tensor() if hasattr(x, "full_tensor") else x
 
 
-def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+def shard_like(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     """Split a whole tensor over the processes in the same way as the DTensor `like`."""
     if not hasattr(like, "full_tensor"):
         return x
@@ -153,7 +153,7 @@ def sharded(x: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     return distribute_tensor(x.to(like.device), like.device_mesh, like.placements)
 
 
-def gathered(state):
+def gather_state(state):
     """Return a copy of the state with whole weights and averages, for writing and validation.
 
     Every process must call it. Without FSDP2 it returns the state itself.
@@ -163,8 +163,8 @@ def gathered(state):
     from gdtool.diffusion.network.model import Model
 
     parameters = dict(state.model.named_parameters())
-    average = {name: whole(x, parameters[name]) for name, x in state.average.items()}
-    weights = {name: whole(p.detach()) for name, p in parameters.items()}
+    average = {name: gather(x, parameters[name]) for name, x in state.average.items()}
+    weights = {name: gather(p.detach()) for name, p in parameters.items()}
     config = state.model.config
     encoder = state.model.encoder if config.encoder == "clip" else None  # frozen, and so not split
     model = Model(config, state.model.codec, encoder).to(next(iter(weights.values())).device).train()

@@ -26,7 +26,7 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.reading import parse_json
 from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
-from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
+from gdtool.diffusion.data.objects import Batch, Objects, draw_batch, object_order
 from gdtool.diffusion.inference.sampling import precision_context
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
@@ -89,7 +89,7 @@ def new_state(model: Model, train: TrainConfig) -> State:
     """Create the state before the first step, with the objective wrapped for all processes."""
     objective = distributed.wrap(Objective(model, train))
     optimizer = make_optimizer(model, train)
-    average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
+    average = {name: distributed.local_part(p).clone() for name, p in model.named_parameters()}
     return State(model, optimizer, average, objective)
 
 
@@ -112,7 +112,7 @@ def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
     return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
 
 
-def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
+def choose_step(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
     """Choose a step's domains and views at random.
 
     In a model with attention across domains, color is among the domains wherever there is more than one.
@@ -168,9 +168,9 @@ def losses(
         )
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
-    counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
+    weighted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
     weight = loss_weight(model.alpha[t], model.sigma[t], train.snr_gamma, train.snr_floor)
-    total = (weight[:, None] * counted).mean()
+    total = (weight[:, None] * weighted).mean()
     parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
 
     snr = (model.alpha[t] / model.sigma[t]).square()
@@ -208,7 +208,7 @@ def train_step(
     """
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
-    step = choose(config, phase, seed, state.step)
+    step = choose_step(config, phase, seed, state.step)
     rate = learning_rate(state, progress, train)
     for group in state.optimizer.param_groups:
         group["lr"] = rate * group["rate"]
@@ -222,10 +222,10 @@ def train_step(
             "raise --batch",
         )
     count = min(train.accumulate, len(idx) // distributed.size())
-    parts_of = [distributed.share_of(part) for part in np.array_split(places, count)]
+    parts_of = [distributed.part_for_process(part) for part in np.array_split(places, count)]
     for number, part in enumerate(parts_of):
         choices, generators = zip(*(step.choices(int(place)) for place in part), strict=True)
-        batch = draw(objects, idx[part], config, train, choices)
+        batch = draw_batch(objects, idx[part], config, train, choices)
         batch = Batch(batch.planes.to(device), batch.condition.to(device), batch.lights.to(device))
         with distributed.synchronised(state.objective, number == len(parts_of) - 1):
             parts = state.objective(batch, step, list(generators))
@@ -233,8 +233,8 @@ def train_step(
             (parts["loss"] * share * distributed.size()).backward()
         for name, value in parts.items():
             sums[name] = sums.get(name, 0.0) + float(value.detach()) * share
-    sums = distributed.total(sums)
-    norm = distributed.local(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
+    sums = distributed.sum_over_processes(sums)
+    norm = distributed.local_part(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
     finite = bool(torch.isfinite(norm))
     if finite:  # a step that is not finite is left out rather than the whole run lost
         state.optimizer.step()
@@ -243,7 +243,7 @@ def train_step(
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
-    weights = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    weights = {name: distributed.local_part(p) for name, p in state.model.named_parameters()}
     torch._foreach_lerp_([state.average[n] for n in names], [weights[n] for n in names], 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
@@ -257,10 +257,10 @@ def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
 
     tensors = {}
     for name, p in state.model.named_parameters():
-        tensors[f"model/{name}"] = distributed.whole(p.detach())
-        tensors[f"average/{name}"] = distributed.whole(state.average[name], p)
+        tensors[f"model/{name}"] = distributed.gather(p.detach())
+        tensors[f"average/{name}"] = distributed.gather(state.average[name], p)
         for key, value in state.optimizer.state.get(p, {}).items():
-            tensors[f"{key}/{name}"] = distributed.whole(value)
+            tensors[f"{key}/{name}"] = distributed.gather(value)
     if distributed.rank() != 0:
         return
     tensors = {name: x.cpu().contiguous() for name, x in tensors.items()}
@@ -286,15 +286,15 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
         )
     with torch.no_grad():
         for name, p in state.model.named_parameters():
-            p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
-            state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
+            p.copy_(distributed.shard_like(tensors[f"model/{name}"], p))
+            state.average[name].copy_(distributed.local_part(distributed.shard_like(tensors[f"average/{name}"], p)))
             moments = {key: tensors[f"{key}/{name}"] for key in MOMENTS if f"{key}/{name}" in tensors}
             if moments:
                 restore_moments(
                     state.optimizer,
                     p,
                     {
-                        key: value if key == "step" else distributed.sharded(value.to(p.device), p)
+                        key: value if key == "step" else distributed.shard_like(value.to(p.device), p)
                         for key, value in moments.items()
                     },
                 )
@@ -366,33 +366,35 @@ def run_training(
     log_path = workspace / "loss.csv"
     target = log_path if distributed.rank() == 0 else Path(os.devnull)
     with target.open("r+" if resumed and log_path.is_file() else "w", newline="") as file:
-        writer = _continued(file, state.step if resumed else 0, model.config.domains)
+        writer = _resume_log(file, state.step if resumed else 0, model.config.domains)
         bar = iter(observers.progress(range(state.step, train.steps), train.steps, "training"))
         while progress_of(state, train, options.minutes) < 1:
             start = time.perf_counter()
             record = train_step(state, objects, train, options.seed, options.minutes, options.device)
-            state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
+            state.seconds += (
+                distributed.sum_over_processes({"s": time.perf_counter() - start})["s"] / distributed.size()
+            )
             writer.writerow(
                 {k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()}
                 | {"seconds": f"{state.seconds:.1f}"}
             )
             file.flush()
             observers.log(record)
-            _tell_skipped(state, observers.warn)
+            _warn_skipped(state, observers.warn)
             next(bar, None)
             if state.step % options.checkpoint_every == 0:
                 save_checkpoint(state, workspace, identity)
             if state.step % options.validate_every == 0:
-                whole = distributed.gathered(state)
+                whole = distributed.gather_state(state)
                 if distributed.rank() == 0:
                     observers.validate(whole)
         for _ in bar:
             break
     save_checkpoint(state, workspace, identity)
-    return distributed.gathered(state)
+    return distributed.gather_state(state)
 
 
-def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
+def _warn_skipped(state: State, warn: Callable[[str], None]) -> None:
     """Warn where the last step was skipped. Raises InputError after MOST_SKIPPED skipped steps in a row."""
     if state.skipped >= MOST_SKIPPED:
         raise InputError(
@@ -404,7 +406,7 @@ def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
 
 
-def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
+def _resume_log(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
     """Create a writer of loss.csv that keeps the rows up to `step`.
 
     A resumed run starts at its checkpoint and writes the later rows again.

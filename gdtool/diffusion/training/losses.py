@@ -43,13 +43,13 @@ def image_error(
         square = square.mean((1, 2, 3)).unflatten(0, (objects, len(domains), -1)).mean(2)
         return square * square.new_tensor([train.domain_weights[i] for i in domains]), square
     square = square.unflatten(1, (3, -1)).unflatten(0, (objects, len(domains), -1))  # (b, d, k, 3, patch², h, w)
-    counted = []
+    weighted = []
     for j, i in enumerate(domains):
         value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
         if DOMAINS[i] in train.absolute_domains:
             value = ((value.mean(2, keepdim=True) + SOFTNESS**2).sqrt() - SOFTNESS).expand_as(value)
-        counted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
-    return torch.stack(counted, 1), square.flatten(2).mean(2)
+        weighted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
+    return torch.stack(weighted, 1), square.flatten(2).mean(2)
 
 
 def view_directions(config: ModelConfig) -> torch.Tensor:

@@ -39,10 +39,10 @@ def execute(order: Order, objects: Objects, observers: Observers | None = None) 
     torch.manual_seed(order.run.seed)
     model = Model(order.model)
     if order.start is not None:
-        from gdtool.diffusion.network.grow import grown
+        from gdtool.diffusion.network.grow import grow_weights
 
         loaded = load_model(order.start)
-        tensors = grown(loaded.state_dict(), loaded.config, order.model)
+        tensors = grow_weights(loaded.state_dict(), loaded.config, order.model)
         check_shapes(order.start, tensors, model.state_dict())
         model.load_state_dict(tensors)
     elif order.model.codec == "vae":

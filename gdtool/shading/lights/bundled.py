@@ -125,7 +125,9 @@ def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
     )
 
 
-def paint(axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = "") -> Environment:
+def rasterise_lobes(
+    axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = ""
+) -> Environment:
     """Evaluate k lobes at the pixels of a lat-long image of height rows and 2 height columns.
 
     axes (k, 3) unit, sharpness (k,), amplitudes (k, 3) linear radiance.

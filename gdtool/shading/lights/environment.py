@@ -98,7 +98,7 @@ class Environment:
         directions = np.stack([ring * np.cos(phi), y, ring * np.sin(phi)], 1)
         return directions, self.image[row, column], self.pdf[row, column]
 
-    def shrunk(self, height: int) -> Environment:
+    def downsampled(self, height: int) -> Environment:
         """Halve the resolution while there are at least 2 * height rows, and both sides are even.
 
         Averages are weighted by solid angle, so the energy stays the same.
@@ -112,7 +112,7 @@ class Environment:
             current = replace(self, image=rows[:, 0::2] + rows[:, 1::2])
         return current
 
-    def cut(self, height: int) -> Environment:
+    def subdivided(self, height: int) -> Environment:
         """Divide pixels into equal ones until there are at least `height` rows and 2 * height columns.
 
         A sum that evaluates the cosine at pixel centres errs by 1.6 % with 8 rows, by 0.02 % with 64.
@@ -123,7 +123,7 @@ class Environment:
 
     def irradiance(self, normals: np.ndarray) -> np.ndarray:
         """Integrate L max(0, n·l) dl for unit normals (n, 3): (n, 3). The sum runs over a copy with about 32 rows."""
-        small = self.shrunk(32).cut(32)
+        small = self.downsampled(32).subdivided(32)
         weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3)
         return np.maximum(normals @ small.directions.reshape(-1, 3).T, 0) @ weighted
 

@@ -129,7 +129,7 @@ class IrradianceMap:
     def __init__(self, environment: Environment, height: int = 48):
         import torch
 
-        small = environment.shrunk(64).cut(64)
+        small = environment.downsampled(64).subdivided(64)
         # The first and last row are the poles: rows that begin half a step away are 0.7 % off there under a studio.
         theta = np.arange(height) / (height - 1) * np.pi
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
@@ -220,9 +220,9 @@ class Prefiltered:
         """Return the prefiltered image of a level. The first call makes it; other threads wait for it."""
         with self.locks[level]:
             if level not in self.images:
-                begun = time.perf_counter()
+                started = time.perf_counter()
                 self.images[level] = filtered_light(self.pyramid, *ROUGHNESS_LEVELS[level])
-                self.seconds += time.perf_counter() - begun
+                self.seconds += time.perf_counter() - started
         return self.images[level]
 
 

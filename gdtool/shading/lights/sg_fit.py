@@ -30,7 +30,7 @@ def fit_sg(
     """
     import torch
 
-    small = environment.shrunk(ROWS)
+    small = environment.downsampled(ROWS)
     d = small.directions.reshape(-1, 3)
     weight = np.repeat(small.solid_angles, small.image.shape[1])
     radiance = small.image.reshape(-1, 3).astype(np.float64)
@@ -83,7 +83,7 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
 
     from gdtool.shading.bsdf.sg import cosine_integral, evaluate
 
-    small = environment.shrunk(ROWS)
+    small = environment.downsampled(ROWS)
     d = torch.tensor(small.directions.reshape(-1, 3), dtype=torch.float64)
     weight = torch.tensor(np.repeat(small.solid_angles, small.image.shape[1]), dtype=torch.float64)[:, None]
     truth = torch.tensor(small.image.reshape(-1, 3), dtype=torch.float64)

@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.reading import MAX_INTEGER_DIGITS
 from gdtool.shading.bsdf.sg import SphericalGaussians
-from gdtool.shading.lights.bundled import paint, random_lobes
+from gdtool.shading.lights.bundled import random_lobes, rasterise_lobes
 from gdtool.shading.lights.environment import Environment
 from gdtool.shading.lights.load import load_environment
 from gdtool.shading.lights.sg_fit import fit_error, fit_sg
@@ -39,7 +39,7 @@ def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, S
                 f"write random: and a whole number of at most {MAX_INTEGER_DIGITS} digits, as in random:7",
             )
         axes, sharpness, amplitudes = random_lobes(np.random.default_rng(int(number)))
-        environment = paint(axes, sharpness, amplitudes, RANDOM_HEIGHT, source).metered()
+        environment = rasterise_lobes(axes, sharpness, amplitudes, RANDOM_HEIGHT, source).metered()
         lobes = SphericalGaussians(
             *(torch.tensor(x, dtype=torch.float64) for x in (axes, sharpness, amplitudes * environment.scale))
         )

@@ -85,7 +85,7 @@ def place_scene(scene: Scene, placement: Placement) -> tuple[Scene, np.ndarray]:
     box = unit_box(used)
     matrix = box if placement.normalize else identity
     if placement.turn:
-        matrix = _turned(used, placement)
+        matrix = _random_turn(used, placement)
     views = placement.views
     if views is not None and placement.normalize:
         digests = [entry.digest for entry in views.manifest.inputs if entry.role == "source"]
@@ -111,7 +111,7 @@ def place_scene(scene: Scene, placement: Placement) -> tuple[Scene, np.ndarray]:
     return dataclasses.replace(scene, vertices=vertices, **directions), matrix
 
 
-def _turned(vertices: np.ndarray, placement: Placement) -> np.ndarray:
+def _random_turn(vertices: np.ndarray, placement: Placement) -> np.ndarray:
     """Choose a random turn about the y axis: source_from_world (4, 4), normalised where the placement says so.
 
     vertices (v, 3): those that faces use. The angle is uniform within placement.turn degrees to either side.
@@ -135,7 +135,7 @@ def _asset_of(source: Any) -> Folder | None:
     return None
 
 
-class Lamps(NamedTuple):
+class PreparedLight(NamedTuple):
     """Hold the light of one object in four forms.
 
     environment: metered. lobes: spherical Gaussians. record: what light.json stores. direct: estimates light on surface
@@ -163,7 +163,7 @@ def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
     return light
 
 
-def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf: str) -> Lamps:
+def prepare_light(renderer: Renderer, light: str, samples: int, seed: int, brdf: str) -> PreparedLight:
     """Prepare a light by its name, as studio() takes it, for shading the renderer's scene.
 
     samples: directions that a point draws from the light, and as many from its reflection. brdf: "gltf" or "paper".
@@ -173,11 +173,16 @@ def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf:
     # Shading runs in threads of this program, a chunk each; torch's would only wait for each other.
     torch.set_num_threads(1)
     environment, lobes, record = studio(light, seed)
-    return Lamps(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))
+    return PreparedLight(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))
 
 
 def render_view(
-    renderer: Renderer, camera: Camera, samples: int, lamps: Lamps | None, domains: tuple[str, ...], exposure: float
+    renderer: Renderer,
+    camera: Camera,
+    samples: int,
+    lamps: PreparedLight | None,
+    domains: tuple[str, ...],
+    exposure: float,
 ) -> dict[str, np.ndarray]:
     """Render one view's images (h, w[, c]) by domain; "color" and "closed_form" only where domains has them.
 

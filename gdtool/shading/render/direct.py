@@ -157,14 +157,14 @@ class DirectLight:
             n_v = (rows_of(points.values["normal"]) * rows_of(points.view)).sum(0)
             self.prefiltered.prepare(lobe_roughness(tensor_of(points.values["roughness"]), n_v))
 
-        begun, counted = time.perf_counter(), np.zeros(len(_RayCounts._fields), np.int64)
+        started, counted = time.perf_counter(), np.zeros(len(_RayCounts._fields), np.int64)
         for start in range(0, len(points), step):
             part = slice(start, start + step)
             counted += self._accumulate(points, part, None if runs is None else runs[:, part], sums[..., part])
         counts = _RayCounts(*counted.tolist())
         self.renderer.counts.spend(
             "directions",
-            begun,
+            started,
             shadow_rays=counts.cast,
             shadow_rays_below_horizon=counts.below_horizon,
             shadow_rays_convex=counts.convex,
@@ -187,7 +187,7 @@ class DirectLight:
         block = min(1 << max(0, points.per_pixel - 1).bit_length(), max(1, POOL // k // 16))
         out = np.empty((2, len(points)), np.int64)
         for which in (0, 1):
-            number = _hashed(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)
+            number = _hash(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)
             out[which] = (number // block) % (POOL // k // block) * block + ((points.sample % block) ^ (number % block))
         return out
 
@@ -208,29 +208,29 @@ class DirectLight:
             )
         if not k:
             return _RayCounts()
-        drawn, numbers = (
+        from_light, numbers = (
             torch.stack([sample.index_select(1, torch.from_numpy(run)) for sample in pool]).unbind(1)
             for pool, run in zip((self.pool, self.pattern), runs, strict=True)
         )
-        mirrored = surface.sample(*numbers[:3])
-        lookup = self.pixels.index_select(0, self._pixel(*mirrored).reshape(-1)).view(k, -1, 4)
-        direction = [torch.cat(pair) for pair in zip(drawn[:3], mirrored, strict=True)]
-        *light, p_light = (torch.cat([drawn[3 + i], lookup[..., i]]) for i in range(4))
+        from_reflection = surface.sample(*numbers[:3])
+        lookup = self.pixels.index_select(0, self._pixel(*from_reflection).reshape(-1)).view(k, -1, 4)
+        direction = [torch.cat(pair) for pair in zip(from_light[:3], from_reflection, strict=True)]
+        *light, p_light = (torch.cat([from_light[3 + i], lookup[..., i]]) for i in range(4))
         terms, p_reflect, above = surface.evaluate(*direction)
         everything = 1 / (p_light + p_reflect).mul_(k).clamp_min_(1e-20)
         visible, counted = everything * above, _RayCounts()
         if self.shadows:
             luminance = sum(float(share) * c for share, c in zip(LUMINANCE, light, strict=True))
             brightness = surface.brightness(terms, luminance).mul_(visible)
-            candidates = _Candidates(direction, above, brightness, torch.cat([drawn[7], numbers[3]]))
+            candidates = _Candidates(direction, above, brightness, torch.cat([from_light[7], numbers[3]]))
             counted = self._apply_shadows(points.position[part], surface, candidates, (visible, everything))
         # Only prefiltered light asks what share of the specular reflection is visible.
         split = self.mode == "prefiltered"
-        for first_row, weight, kept in (
+        for first_row, weight, used_terms in (
             (VISIBLE, visible, terms),
             (ALL if split else ALL_DIFFUSE, everything, terms[:3] if split else terms[2:3]),
         ):
-            for row, term in enumerate(kept, first_row):
+            for row, term in enumerate(used_terms, first_row):
                 weighted = term * weight
                 for channel, c in enumerate(light):
                     torch.sum(weighted * c, 0, out=result[row, channel])
@@ -327,7 +327,7 @@ def _visible_share(visible: np.ndarray, everything: np.ndarray, known: np.ndarra
     return np.clip((v + PRIOR * k) / np.maximum(u + PRIOR * k, np.float32(1e-20)), 0, 1)
 
 
-def _hashed(index: np.ndarray, seed: int) -> np.ndarray:
+def _hash(index: np.ndarray, seed: int) -> np.ndarray:
     """Hash indices (n,) and a seed to non-negative int64 by SplitMix64."""
     with np.errstate(over="ignore"):
         x = splitmix64(index.astype(np.uint64) + np.uint64((seed * 0x9E3779B97F4A7C15) % 2**64))

@@ -57,12 +57,12 @@ def render_pictures(
     label) wraps the loop over the views.
     """
     shade = light.color(options.exposure) if isinstance(light, DirectLight) else None
-    out, begun = Pictures([], [], []), time.perf_counter()
+    out, started = Pictures([], [], []), time.perf_counter()
     for number, camera in enumerate(progress(cameras, len(cameras), "frames")):
         seconds = None
         if options.seconds is not None:
             # Each view gets an equal part of the time that is left.
-            seconds = max(0.0, options.seconds - (time.perf_counter() - begun)) / (len(cameras) - number)
+            seconds = max(0.0, options.seconds - (time.perf_counter() - started)) / (len(cameras) - number)
         frame = renderer.buffers(camera, options.samples, shade, Goal(seconds, options.psnr))
         out.psnr.append(renderer.counts.estimated_psnr)
         if shade is None:

@@ -228,9 +228,9 @@ class Renderer:
             origins += camera.backward * back
         else:
             back = 0.0
-        begun = time.perf_counter()
+        started = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
-        self.counts.spend("rays", begun, samples=len(pixel))
+        self.counts.spend("rays", started, samples=len(pixel))
         hit = np.flatnonzero(face_idx >= 0)
         if len(hit) < len(pixel):
             pixel, sample, face_idx, distance, along = (x.take(hit) for x in (pixel, sample, face_idx, distance, along))
@@ -260,11 +260,11 @@ class Renderer:
             shade: function from ShadingPoints to {"color": (n, 3)}; with it, the result has the image "color".
             goal: when to stop earlier.
         """
-        begun = time.perf_counter()
+        started = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
         self.counts.spend(
-            "bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
+            "bounds", started, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
         )
         film, pattern = _Film(height * width), pixel_pattern(samples, BASE_SAMPLES)
         pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
@@ -285,7 +285,7 @@ class Renderer:
                 break
             pixel, error = film.unresolved(pixel, width, height, tolerance, done)
             if goal.seconds is not None:
-                spent = time.perf_counter() - begun
+                spent = time.perf_counter() - started
                 room = int((goal.seconds - spent) / spent * taken / done) if goal.seconds > spent else 0
                 if room < len(pixel):
                     pixel = np.sort(pixel[np.argsort(-error, kind="stable")[:room]])
@@ -305,10 +305,10 @@ class Renderer:
         step = -(-len(pixel) // (bands if bands == 1 else -(-bands // self.caster.threads) * self.caster.threads))
 
         def trace_band(part: np.ndarray) -> tuple[np.ndarray, int, ShadingPoints, dict]:
-            begun = time.perf_counter()
+            started = time.perf_counter()
             points = self.trace_pixels(camera, part, pattern, first, shade is not None)
             shaded = shade(points) if shade is not None and len(points) else {}
-            self.counts.spend("samples", begun, pixels_refined=len(part) if first == BASE_SAMPLES else 0)
+            self.counts.spend("samples", started, pixels_refined=len(part) if first == BASE_SAMPLES else 0)
             return part, more, points, shaded
 
         waiting: deque = deque()
@@ -413,7 +413,7 @@ class _Film:
         if done <= OUTLINE_SAMPLES:
             covered = (self.hits > 0).reshape(height, width)
             whole = (self.hits == self.samples).reshape(height, width) & covered
-            partly |= ((hits == 0) & _dilated(covered)[pixel]) | ((hits > 0) & _dilated(~whole)[pixel])
+            partly |= ((hits == 0) & _dilate(covered)[pixel]) | ((hits > 0) & _dilate(~whole)[pixel])
         worst = np.zeros(len(pixel))
         some = np.flatnonzero(hits > 0)
         for name in STORED_SCALE:
@@ -423,7 +423,7 @@ class _Film:
         if done <= OUTLINE_SAMPLES:
             image = np.zeros(width * height, bool)
             image[pixel[chosen]] = True
-            chosen |= (hits > 0) & _dilated(image.reshape(height, width))[pixel]
+            chosen |= (hits > 0) & _dilate(image.reshape(height, width))[pixel]
         return pixel[chosen], np.where(partly, np.inf, worst)[chosen]
 
     def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
@@ -444,7 +444,7 @@ class _Film:
         return out
 
 
-def _dilated(inside: np.ndarray) -> np.ndarray:
+def _dilate(inside: np.ndarray) -> np.ndarray:
     """Dilate a bool image (h, w) by one pixel in all eight directions; flat (h * w,)."""
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]

@@ -125,6 +125,6 @@ def _lookup_seconds(count: int = 4096) -> float:
     reader = TextureReader(Texture(np.zeros((2, 2, 3), np.uint8), "srgb"))
     uv = np.random.default_rng(0).random((count, 2))
     reader.read(uv)  # the first read warms up
-    begun = time.perf_counter()
+    started = time.perf_counter()
     reader.read(uv)
-    return (time.perf_counter() - begun) / count
+    return (time.perf_counter() - started) / count

@@ -36,7 +36,7 @@ def _columns(values: np.ndarray, dtype=np.float32) -> np.ndarray:
 
 
 @dataclass
-class _Places:
+class _SurfacePoints:
     """Hold n points on the surface.
 
     face_idx (n,). corners (3, n): vertex indices. exact, weights (3, n): barycentric coordinates in float64 and in
@@ -52,9 +52,9 @@ class _Places:
     def __len__(self) -> int:
         return len(self.face_idx)
 
-    def part(self, chosen: np.ndarray) -> _Places:
+    def part(self, chosen: np.ndarray) -> _SurfacePoints:
         """Return the points with these indices (m,)."""
-        return _Places(
+        return _SurfacePoints(
             self.face_idx[chosen],
             self.corners[:, chosen],
             self.exact[:, chosen],
@@ -123,12 +123,16 @@ class SurfaceLookup:
             area = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
             self._uv_areas[texture.uv_set] = area / np.maximum(self.face_areas, 1e-300)
 
-    def _places(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> _Places:
+    def _surface_points(
+        self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None
+    ) -> _SurfacePoints:
         """Make surface points from faces (n,) and barycentric coordinates (n, 3)."""
         face_idx, exact = np.asarray(face_idx, np.intp), _columns(barycentric, np.float64)
-        return _Places(face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint)
+        return _SurfacePoints(
+            face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint
+        )
 
-    def _read(self, textures: dict[str, Texture | None], at: _Places) -> dict[str, np.ndarray]:
+    def _read(self, textures: dict[str, Texture | None], at: _SurfacePoints) -> dict[str, np.ndarray]:
         """Read textures at n surface points: linear texels (c, n) by name.
 
         A texture that is None, or whose UV set the scene lacks, is left out. Textures of one layout are read together.
@@ -154,7 +158,7 @@ class SurfaceLookup:
             out |= {name: texels[part] for name, part in zip(names, reader.parts, strict=True)}
         return out
 
-    def _shading_normals(self, at: _Places) -> np.ndarray:
+    def _shading_normals(self, at: _SurfacePoints) -> np.ndarray:
         """Interpolate unit vertex normals (3, n); the face's normal where there are none, or where they cancel."""
         if self._normals is None:
             return np.take(self._flat, at.face_idx, axis=1)
@@ -166,7 +170,7 @@ class SurfaceLookup:
         smooth /= length
         return smooth
 
-    def _tangent(self, texture: Texture, at: _Places) -> np.ndarray:
+    def _tangent(self, texture: Texture, at: _SurfacePoints) -> np.ndarray:
         """Interpolate tangents with handedness (4, n): the file's, else MikkTSpace's for the texture's UV set."""
         with self._lock:
             self._make_tangents(texture)
@@ -226,7 +230,7 @@ class SurfaceLookup:
 
         The cutoff is 0 for OPAQUE materials, the material's for MASK, and 0.5 for BLEND.
         """
-        scene, at = self.scene, self._places(face_idx, barycentric)
+        scene, at = self.scene, self._surface_points(face_idx, barycentric)
         alpha, cutoff = np.ones(len(at), np.float32), np.zeros(len(at), np.float32)
         owner = scene.material_idx[at.face_idx]
         for m in np.unique(owner):
@@ -270,7 +274,9 @@ class SurfaceLookup:
                 _specular), all float32; unlit (n,) bool.
         """
         scene, n = self.scene, len(face_idx)
-        points = self._places(face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,)))
+        points = self._surface_points(
+            face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,))
+        )
         out = _Attributes.empty(n)
         vertex_normal = self._shading_normals(points)
         normal = vertex_normal
@@ -317,7 +323,9 @@ class SurfaceLookup:
             normal = normal * np.where(dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
         return out.as_dict(normal, geometric)
 
-    def _fill(self, out: _Attributes, at, material: Material, texels: dict[str, np.ndarray], here: _Places) -> None:
+    def _fill(
+        self, out: _Attributes, at, material: Material, texels: dict[str, np.ndarray], here: _SurfacePoints
+    ) -> None:
         """Fill the attributes of points of one material, except for their normals and emission.
 
         at: index of the points in out. texels: what _read() returned for these points, which are `here`.

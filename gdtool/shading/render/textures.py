@@ -83,7 +83,7 @@ class TextureReader:
         )
         self._lock = threading.Lock()
         # Lookups of the finest level so far, and all of it decoded once they are many.
-        self._asked, self._decoded = 0, None
+        self._lookups, self._decoded = 0, None
 
     @property
     def channels(self) -> int:
@@ -112,7 +112,7 @@ class TextureReader:
         colored: whether the image is sRGB. Channels are decoded one at a time, since numpy is slow on rows as short as
         a texel.
         """
-        for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
+        for i, srgb in enumerate(_srgb_channels(texels.shape[-1], colored)):
             if srgb:
                 out[..., i] = self._linear(texels[..., i])
             else:
@@ -144,14 +144,18 @@ class TextureReader:
                 self._make_next()
             return self.levels[k - 1]
 
-    def _levelled(self, k: int, count: int) -> np.ndarray | None:
+    def _decoded_level(self, k: int, count: int) -> np.ndarray | None:
         """Return level k decoded, or None where it is cheaper to decode only the texels of `count` more lookups."""
         if k:
             return self.level(k)
         with self._lock:
             texels = self.images[0].shape[0] * self.images[0].shape[1]
-            self._asked += count
-            if self._decoded is None and self._asked > DECODE_SHARE * texels and texels * self.channels <= MAX_DECODED:
+            self._lookups += count
+            if (
+                self._decoded is None
+                and self._lookups > DECODE_SHARE * texels
+                and texels * self.channels <= MAX_DECODED
+            ):
                 self._decoded = self.level(0)
             return self._decoded
 
@@ -161,25 +165,27 @@ class TextureReader:
         parts = [slice(0, self.channels)] if self.levels else self.parts
         height, width = finer[0].shape[:2]
         coarse = np.empty((max(height // 2, 1), max(width // 2, 1), self.channels), np.float32)
-        halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
+        halve = self._halve_even if height % 2 == width % 2 == 0 else self._halve_odd
         # Coarser levels are linear already.
         colored = None if self.levels else self.colored
 
         def make(row: int) -> None:
             for i, (image, part) in enumerate(zip(finer, parts, strict=True)):
-                halved(image, coarse[row : row + BAND // 2, :, part], row, None if colored is None else colored[i])
+                halve(image, coarse[row : row + BAND // 2, :, part], row, None if colored is None else colored[i])
 
         _each_band(make, len(coarse), BAND // 2)
         self.levels.append(coarse)
 
-    def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
+    def _halve_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
         """Average 2 x 2 texels of finer (h, w, c) into out, the rows of the coarser level from `row` on.
 
         Both sides of finer are even. colored: whether it is stored in sRGB; None where it is linear float32 already.
         """
         band = finer[2 * row : 2 * (row + len(out))]
         wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
-        for i, srgb in enumerate([False] * band.shape[2] if colored is None else _colored(band.shape[2], colored)):
+        for i, srgb in enumerate(
+            [False] * band.shape[2] if colored is None else _srgb_channels(band.shape[2], colored)
+        ):
             values = band[..., i]
             if srgb:
                 values = self._linear(values)
@@ -188,9 +194,9 @@ class TextureReader:
             unit = np.float32(0.25) * (np.float32(1) if srgb or colored is None else self._unit)
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
-    def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average as _halve_even, where a side is odd; a coarser texel then covers parts of three finer ones, by area."""
-        rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
+    def _halve_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
+        """Average as _halve_even, where a side is odd: a coarser texel covers parts of three finer ones, by area."""
+        rows, columns = _area_shares(finer.shape[0])[:, row : row + len(out)], _area_shares(finer.shape[1])
         band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
             linear = np.empty(band.shape, np.float32)
@@ -223,7 +229,7 @@ class TextureReader:
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
         """Read (n, c) linear float32 from level k at transformed uv (n, 2)."""
-        image = self._levelled(k, len(uv))
+        image = self._decoded_level(k, len(uv))
         height, width = self.images[0].shape[:2] if image is None else image.shape[:2]
         flat = None if image is None else image.reshape(-1, self.channels)
 
@@ -245,8 +251,8 @@ class TextureReader:
         x0, y0 = x0.astype(np.int64), y0.astype(np.int64)
         left, right = (wrap_index(x0 + i, width, self.texture.wrap_u) for i in (0, 1))
         top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
-        upper = _between(texels(top + left), texels(top + right), fx)
-        return _between(upper, _between(texels(bottom + left), texels(bottom + right), fx), fy)
+        upper = _lerp(texels(top + left), texels(top + right), fx)
+        return _lerp(upper, _lerp(texels(bottom + left), texels(bottom + right), fx), fy)
 
 
 def _each_band(work, rows: int, band: int) -> None:
@@ -259,13 +265,13 @@ def _each_band(work, rows: int, band: int) -> None:
         work(0)
 
 
-def _colored(channels: int, colored: bool) -> list[bool]:
+def _srgb_channels(channels: int, colored: bool) -> list[bool]:
     """List for each channel of an image whether it is sRGB; alpha never is."""
     last = channels if channels in (1, 3) else channels - 1
     return [colored and i < last for i in range(channels)]
 
 
-def _shares(size: int) -> np.ndarray:
+def _area_shares(size: int) -> np.ndarray:
     """Compute the share by area of finer texels 2i, 2i + 1, … in coarser texel i: (taps, max(size // 2, 1)) float32."""
     half = size // 2
     if half == 0:
@@ -276,7 +282,7 @@ def _shares(size: int) -> np.ndarray:
     return (np.stack([half - i, np.full(half, half), i + 1]) / size).astype(np.float32)
 
 
-def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+def _lerp(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
     """Interpolate a + fraction (b − a) for arrays that broadcast, overwriting b."""
     b -= a
     b *= fraction
