@@ -1,4 +1,4 @@
-"""What goes into the network comes out of it."""
+"""Check that domain images survive encoding and decoding, and how sampled images become views."""
 
 import numpy as np
 import pytest
@@ -91,8 +91,8 @@ def test_whole_frame_pads_to_a_square():
     assert out[12:28, :, 3].min() > 0.99
 
 
-def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(sphere):
-    """Whatever the network guessed: here a sphere everywhere, and a picture that shows a slanted shape."""
+def test_front_and_back_silhouettes_are_the_pictures(sphere):
+    """The sampled images show a sphere, the picture a slanted shape: front and back get the picture's silhouette."""
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import views_from_images
 
@@ -120,18 +120,18 @@ def test_mirrored_images_are_the_images_of_the_mirrored_object():
 
     generator, names = torch.Generator().manual_seed(0), tuple(camera.name for camera in rig("six", 8))
     planes = 2 * torch.rand(6, 13, 8, 8, generator=generator) - 1
-    turned = mirror_object(planes, torch.zeros(4, 8, 8), torch.zeros(16, 7), names)[0]
+    mirrored_planes = mirror_object(planes, torch.zeros(4, 8, 8), torch.zeros(16, 7), names)[0]
     for domains in (tuple(range(6)), (0, 1), (2, 3)):
-        one, other = (encode(x[None], domains, torch.tensor([1.0])) for x in (planes, turned))
-        torch.testing.assert_close(mirror_images(one, domains, names), other)
-        torch.testing.assert_close(mirror_images(other, domains, names), one)
+        images, images_of_mirrored = (encode(x[None], domains, torch.tensor([1.0])) for x in (planes, mirrored_planes))
+        torch.testing.assert_close(mirror_images(images, domains, names), images_of_mirrored)
+        torch.testing.assert_close(mirror_images(images_of_mirrored, domains, names), images)
 
 
-def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
+def test_metallic_is_pushed_to_its_ends_and_edges_stay_soft():
     from gdtool.diffusion.inference.result import sharpen_metallic
 
-    given = torch.linspace(0, 1, 101, dtype=torch.float64)
-    out = sharpen_metallic(given)
+    metallic = torch.linspace(0, 1, 101, dtype=torch.float64)
+    out = sharpen_metallic(metallic)
     assert out[0] == 0
     assert out[50] == 0.5
     assert out[100] == 1
@@ -142,7 +142,7 @@ def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
     assert out[40] > 0.1
 
 
-def test_only_metallic_is_decided(sphere):
+def test_only_metallic_is_sharpened(sphere):
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import sharpen_metallic, views_from_images
 
@@ -157,7 +157,7 @@ def test_only_metallic_is_decided(sphere):
 
 
 def test_views_from_opposite_sides_get_one_outline():
-    """A model that guesses the outline from the right larger than from the left: both get the mean."""
+    """Two opposite views with different outlines both get the mean of the two."""
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import average_opposite_views
 
@@ -170,8 +170,11 @@ def test_views_from_opposite_sides_get_one_outline():
     torch.testing.assert_close(out[slanted], soft[slanted])
 
 
-def test_depth_stays_within_the_outlines_that_other_views_show():
-    """Of a ball whose right side the model draws too far out and whose front too far in; what is right stays."""
+def test_depth_stays_within_the_outlines_of_other_views():
+    """Displace a ball's depth, too far out in the right view and too far in in the front view.
+
+    Both are moved back within the ball's outlines, and correct depth stays.
+    """
     from gdtool.cameras import backproject
     from gdtool.diffusion.inference.result import move_depth_within_silhouettes
     from tests.fields.shapes import sphere, views_of
@@ -186,10 +189,10 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     wrong = images["depth"].copy()
     wrong[names.index("right")] -= 0.1 * (mask[names.index("right")] > 0.5)
     wrong[names.index("front")] += 0.9 * (mask[names.index("front")] > 0.5)
-    found = move_depth_within_silhouettes(wrong, mask, cameras)
+    result = move_depth_within_silhouettes(wrong, mask, cameras)
     for name in ("right", "front"):
         k = names.index(name)
-        points = backproject(cameras[k], found[k].astype(float))[mask[k] > 0.99]
+        points = backproject(cameras[k], result[k].astype(float))[mask[k] > 0.99]
         before = backproject(cameras[k], wrong[k].astype(float))[mask[k] > 0.99]
         # Within the ball's width in every row that the others show, though the ray alone would allow more.
         reach = np.hypot(points[:, 0], points[:, 2]) - np.sqrt(np.maximum(0.4**2 - points[:, 1] ** 2, 0))
@@ -197,7 +200,7 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
         assert (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
     others = [k for k, name in enumerate(names) if name not in ("right", "front")]
     np.testing.assert_allclose(
-        found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
+        result[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
     )
     flat = mask * 0
     assert (move_depth_within_silhouettes(wrong, flat, cameras) == wrong).all()
@@ -205,15 +208,14 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     elsewhere = mask.copy()
     elsewhere[1::2] = 0
     elsewhere[1::2, :, :2] = 1
-    found = move_depth_within_silhouettes(images["depth"], elsewhere, cameras)
+    result = move_depth_within_silhouettes(images["depth"], elsewhere, cameras)
     inside = elsewhere > 0.5
-    assert found[inside].min() >= cameras[0].near
-    assert found[inside].max() <= cameras[0].far
+    assert result[inside].min() >= cameras[0].near
+    assert result[inside].max() <= cameras[0].far
 
 
-def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
-    """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces
-    it."""
+def test_an_outline_between_pixels_moves_depth_by_a_fraction_of_a_pixel():
+    """A wall leans by a fifth of a pixel a row: its depth in the facing view has no steps of whole pixels."""
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import move_depth_within_silhouettes
 
@@ -227,6 +229,6 @@ def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
     mask[front, :, 20:-20] = 1
     mask[right] = np.clip(edge[:, None] - np.abs(column + 0.5 - size / 2) + 0.5, 0, 1)
     depth = np.where(mask > 0, np.linalg.norm(cameras[front].position) - 0.5, 0).astype(np.float32)
-    found = move_depth_within_silhouettes(depth, mask, cameras)[front, :, size // 2]
+    result = move_depth_within_silhouettes(depth, mask, cameras)[front, :, size // 2]
     wall = np.linalg.norm(cameras[front].position) - edge * pixel
-    np.testing.assert_allclose(found, wall, atol=0.1 * pixel)
+    np.testing.assert_allclose(result, wall, atol=0.1 * pixel)

@@ -1,4 +1,4 @@
-"""A model at twice the size starts as the small one's prediction, each pixel a square."""
+"""Check that a model grown to larger images predicts what the small one predicts, each pixel repeated to a square."""
 
 import msgspec
 import pytest

@@ -29,7 +29,7 @@ from gdtool.shading.lights.load import load_environment
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
 from tests.conftest import ROOT
 from tests.fields.shapes import torus, views_folder
-from tests.fields.shapes import unpack_views as seen
+from tests.fields.shapes import views_of as seen
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from gdtool.folders.views import read_views
 from gdtool.images.io import encode_png, write_png
 from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, with_textures
 from tests.fields.shapes import torus, views_folder
-from tests.fields.shapes import unpack_views as seen
+from tests.fields.shapes import views_of as seen
 
 FACE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
 RED, BLUE = (np.full((2, 2, 3), color, np.uint8) for color in ((255, 0, 0), (0, 0, 255)))
