@@ -144,7 +144,7 @@ def load(folder: Path):
         )
     tensors, _ = read_tensors(folder / UNET)
     for part, name in (("vae", "diffusion_pytorch_model"), ("image_encoder", "model")):
-        # A pickle or a damaged file is named before a library opens it.
+        # Raise an error for a pickle or a damaged file before a library opens it.
         read_tensors(folder / part / f"{name}.safetensors")
     tensors = {translate_key(name): tensor.float() for name, tensor in tensors.items()}
     config = read_config(folder, tensors)

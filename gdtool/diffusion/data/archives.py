@@ -30,7 +30,7 @@ MAX_OBJECT_BYTES = 16 << 30  # unpacked, of one views folder: what lies on the d
 # Of a compressed archive, unpacked over packed: PNG and EXR are packed already, and padding with zeros gives some 20
 # for the smallest pictures.
 MAX_RATIO = 200
-MIN_JUDGED_BYTES = 64 << 20  # unpacked; below it a ratio says nothing and harms nothing
+MIN_JUDGED_BYTES = 64 << 20  # unpacked; smaller archives may have any ratio
 MAX_HEADER_BYTES = 1 << 20  # of an extended header (long names, PAX records), which is read whole
 
 _PACK = "pack it again with tar, plain or compressed"
@@ -50,7 +50,7 @@ def split_member_name(member: str) -> tuple[str, str]:
     key, _, extension = path.name.partition(".")
     if "." in extension:  # WebDataset: KEY.manifest.json, KEY.color.front.png
         return str(path.with_name(key)), "/".join(extension.split(".")[:-1]) + path.suffix
-    # plain: pictures lie one folder deeper than the manifest, whose neighbours are known
+    # plain: pictures are one folder deeper than the manifest, except for the contact sheet
     root = path.parent if path.suffix not in (".png", ".exr") or path.stem == "contact_sheet" else path.parent.parent
     return str(root), str(path.relative_to(root))
 

@@ -14,8 +14,8 @@ from gdtool.images.color import linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image
 from gdtool.images.mask import foreground
 
-LEAST_PIXELS = 32  # along the picture's shorter side: less shows the model nothing
-FINEST = 8  # pixels of picture.png across one of a view
+LEAST_PIXELS = 32  # along the picture's shorter side; the model needs as much detail
+FINEST = 8  # most pixels of picture.png across one pixel of a view
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
         image = image.astype(np.float32) / np.iinfo(image.dtype).max
         if image.ndim == 3 and image.shape[2] == 4 and image[..., 3].max() > 0.5:
             image = np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
-            # Centred, and as large as the front view: a picture's scale is what the rig's scale is relative to.
+            # Centred and as large as in the front view, as a picture is framed when sampling.
             conditions.append(condition_plane(frame(image, size, extent)))
     conditions = [shrink(c, size) for c in conditions]
     light = np.zeros((LIGHTS, 7), np.float32)
@@ -179,7 +179,7 @@ def decode_dataset(
             array.flush()
         part = names_file.with_suffix(".part")
         part.write_text(json.dumps(names))
-        part.replace(names_file)  # a killed run leaves no half of it
+        part.replace(names_file)  # a killed run leaves no partial file
     names = read_json(names_file)
     if not names:
         raise InputError("dataset", "has no object that can be trained on", "render it with gdtool render-dataset")

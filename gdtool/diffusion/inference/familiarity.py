@@ -18,7 +18,7 @@ import numpy as np
 FILE = "pictures.json"  # in a model folder
 TAIL = 0.005  # share of the training pictures left out at each end
 MARGIN = 0.1  # of the range, added at each end
-# Figures of a result (result_figures) and what one of them, and the usual most of it, says to the user.
+# Figures of a result (result_figures), and the text of a warning with its value and its usual maximum.
 DOUBTS = {
     "outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
     "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, "
@@ -46,7 +46,7 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
     height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
     color = 0.5 + 0.5 * rgba[:3] / np.maximum(alpha, 1e-3)
     grey = color.mean(0)
-    # neighbours that are both inside: texture, and how much of the box's outline the subject has
+    # differences of neighbouring pixels, and whether both are inside
     steps = [
         (
             np.abs(np.diff(grey, axis=a)),

@@ -15,15 +15,15 @@ import numpy as np
 from gdtool.cameras import Camera, backproject, project
 from gdtool.images.sampling import bilinear
 
-LEAST_WIDTH_PX = 2  # of a lost part; a narrower one is the outlines' error
-OVERLAP_PX = 2  # pixels of the existing object around a part that are drawn too, so that it is joined
+LEAST_WIDTH_PX = 2  # least width of a lost part; narrower gaps are errors of the outlines
+OVERLAP_PX = 2  # pixels of the object around a part that are drawn with it, to join the two
 DEPTH_SIGMA = 0.08  # world units: standard deviation of the front view's depth
 FAINT = 0.02  # least coverage in a logarithm
 PLACE_BLUR_PX = 1.5  # Gaussian blur of a part's depth
 THIN, THICK = 1.0, 3.0  # pixels: least and most half thickness of a part
-RANGE = 0.75  # world units about the origin in which a part is looked for
+RANGE = 0.75  # world units to either side of the origin that are searched for a part
 PER_PIXEL = 2  # candidate depths per pixel size
-LEAST_FACING = 0.2  # cosine: least facing of a normal that is drawn
+LEAST_FACING = 0.2  # least cosine between a drawn normal and the direction to the camera
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def find_lost_part(
     lost = binary_opening(lost, np.ones((LEAST_WIDTH_PX, LEAST_WIDTH_PX)))
     if not lost.any():
         return None
-    within = distance_transform_edt(shown) - 0.5  # of a pixel's centre
+    within = distance_transform_edt(shown) - 0.5  # distance of the pixel's centre
     half = np.clip(within, THIN, THICK) * pixel
     if depth is not None:
         score -= 0.5 * ((places - (depth + half)[row, column][:, None]) / DEPTH_SIGMA) ** 2

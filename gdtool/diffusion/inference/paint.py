@@ -13,10 +13,11 @@ import numpy as np
 
 from gdtool.images.detail import DARK, detail_gain, guided, masked_mean
 
-# On held-out and real models: of detail whose gain is less in the model's albedo the true one has next to none, of what
-# has more, all.
+# Contrast of a detail in the model's albedo, relative to that in the color. Below LIGHT the true albedo has next to none
+# of the detail, above PAINT all of it; measured on held-out and real models.
 LIGHT, PAINT = 0.3, 0.5
-# Pixels and squared normals: over which light is linear in the normal, and what says nothing of it.
+# WIDTH: pixels around which light is fitted as a linear function of the normal. LEAST: variance of the normals, squared
+# units, that counts as none in that fit.
 WIDTH, LEAST = 6.0, 0.005
 
 

@@ -65,7 +65,7 @@ def warn_of_doubts(
     if not default:
         out.skip(
             "the model's doubt of its result",
-            "what is usual is known of the model's own steps, without guidance, in all domains",
+            "its usual figures were measured with the model's default steps, without guidance, in all domains",
         )
         return
     unsure = describe_doubts(report, read_ranges(ranges_folder))

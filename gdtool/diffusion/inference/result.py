@@ -12,11 +12,10 @@ from gdtool.diffusion.inference.paint import restore_albedo_contrast
 from gdtool.diffusion.network.encoding import coverage, decode
 from gdtool.folders.views import Views
 
-# The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too
+# Sampled coverage at which outlines overlap the true ones most, at no cost in color; at one half they cover 4 % too
 # little.
 OUTLINE = 0.45
-# Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out
-# objects; edges stay soft.
+# Power that the odds of metallic are raised to. Above 3 it makes no difference on held-out objects; edges stay soft.
 METALLIC_POWER = 4
 
 
@@ -39,7 +38,7 @@ def sharpen_metallic(metallic: torch.Tensor) -> torch.Tensor:
 
 def average_opposite_views(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     """Average the coverage (k, h, w) of orthographic views from opposite sides, whose outlines are mirror images."""
-    out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
+    out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # axes of the opposite camera in this camera's frame
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):
             if camera.projection == opposite.projection == "orthographic" and np.allclose(
@@ -79,7 +78,7 @@ def move_depth_within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: 
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
             lacking = np.clip(column, first[:, None], last[:, None]) - column
             out[k] += np.where(inside & shown[:, None], lacking / per_depth, 0.0)
-        # Outlines that contradict one another would move points anywhere.
+        # Contradictory outlines would move points out of the camera's range.
         out[k] = np.where(inside, np.clip(out[k], camera.near, camera.far), out[k])
     return out.astype(np.float32)
 

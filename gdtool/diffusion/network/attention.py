@@ -87,7 +87,7 @@ class CrossDomainAttention(Attention):
     def __init__(self, width: int, heads: int, two_way: bool):
         super().__init__(width, heads)
         self.two_way = two_way
-        # One layer over the concatenated answers of the other domains; a domain that is absent contributes nothing.
+        # One layer over the concatenated results of the other domains; an absent domain contributes nothing.
         self.fuse = nn.Linear((len(DOMAINS) - 1) * width, width)
         nn.init.zeros_(self.to_out[0].weight)
         nn.init.zeros_(self.to_out[0].bias)

@@ -76,14 +76,14 @@ class ClipEncoder(nn.Module):
                 pretrained_part(config, "image_encoder"), use_safetensors=True
             )
         self.antialias = config.convention == "wonder3d"
-        # in a list, so that its weights are neither trained nor saved with ours
+        # in a list, so that its weights are neither trained nor saved with the model's
         self.frozen = [clip.requires_grad_(False).eval()]
 
     def forward(self, rgba):
         """Map rgba (b, 4, h, w) in [-1, 1] to one token (b, 1, 768)."""
         clip = self.frozen[0].to(rgba.device)
         image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
-        image = image.clamp(0, 1) if self.antialias else image  # as pictures of 8 bits are
+        image = image.clamp(0, 1) if self.antialias else image  # as after quantising to 8 bits
         mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
         with torch.no_grad():
             return clip((image - mean) / deviation).image_embeds.unsqueeze(1)

@@ -88,7 +88,7 @@ def sample(
         if a > 1e-6:
             width = math.log(a_next / s_next) - math.log(a / s)  # half log-SNR
             if scheduler == "dpm" and before is not None:
-                weight = width / (2 * last_width)  # 0 where the last step came out of pure noise
+                weight = width / (2 * last_width)  # 0 after a step that started from pure noise
                 direction = (1 + weight) * clean - weight * before
         # a_next x0 + s_next e with e from x and x0: DDIM, and DPM-Solver++ once x0 is extrapolated
         x = a_next * direction + s_next * (x - a * direction) / s

@@ -190,7 +190,7 @@ class UNet(nn.Module):
         self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
         self.latent_channels = latent_channels
         if config.condition_skip:
-            # A gate per (domain, view) on the condition's own pixels. The front color view nearly is the condition.
+            # A gate for each (domain, view) on the condition's pixels: 1 for the front color view, which nearly is it.
             gate = torch.zeros(len(DOMAINS), len(config.views))
             gate[0, 0] = 1.0
             self.condition_gate = nn.Parameter(gate)

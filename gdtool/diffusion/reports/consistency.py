@@ -12,8 +12,8 @@ from gdtool.cameras import project, rays
 from gdtool.folders.views import Views
 
 INSIDE = 0.99  # coverage of a pixel whose value is not mixed with the background
-EDGE = 0.05  # jump in depth between neighbours, world units, that is an edge and no slope
-SEEN = 0.1  # a point this far behind what another view sees is hidden from it, world units
+EDGE = 0.05  # world units: a larger difference in depth between neighbours is an edge and no slope
+SEEN = 0.1  # world units: a point further behind the surface that another view sees is hidden from it
 
 
 def consistency(views: Views) -> dict[str, float]:

@@ -28,7 +28,7 @@ from gdtool.diffusion.training.losses import LIT, LitObject, rendering_error, vi
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
-# Of the peak: what training a UNet of this size in bfloat16 commonly reaches; the one assumption here.
+# Share of the peak that training a UNet of this size in bfloat16 commonly reaches: an assumption, the only one here.
 UTILISATION = 0.35
 # Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
 BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
@@ -112,7 +112,7 @@ def step_cost(
         dtype: of weights and activations.
         device: where the pass runs; "meta" computes no values.
     """
-    # Two passes: the counter's own record of modules keeps tensors alive that checkpointing would have freed.
+    # Two passes, since the FLOP counter keeps tensors alive that checkpointing would have freed.
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     _one_step(config, domains, views, objects, fused, dtype, device, counter)
     model = _one_step(config, domains, views, objects, fused, dtype, device, memory)
@@ -138,7 +138,7 @@ def _one_step(
         context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
         model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
         model.alpha, model.sigma = model.alpha.to(dtype), model.sigma.to(dtype)
-    # sinusoid() computes in float32, which the weights here are not: what it gives is cast
+    # sinusoid() returns float32; the hook casts it to the weights' type
     hook = model.unet.time_embedding.register_forward_pre_hook(lambda module, args: (args[0].to(dtype),))
     with fused_attention() if fused else contextlib.nullcontext(), watch:
         if config.encoder == "patch":

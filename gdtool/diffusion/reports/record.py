@@ -22,8 +22,8 @@ from gdtool.images.io import write_png
 if TYPE_CHECKING:
     from gdtool.diffusion.training.worker import Order
 
-MOST_PICTURES = 4000  # objects whose pictures the usual range of a picture's figures is measured on
-PICTURES_EACH = 2  # condition images of an object that are measured
+MOST_PICTURES = 4000  # most objects whose pictures are measured for the ranges of figures
+PICTURES_EACH = 2  # most condition images of an object that are measured
 
 
 class Recorder:

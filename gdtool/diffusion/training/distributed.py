@@ -22,8 +22,8 @@ import torch
 import torch.distributed as dist
 from torch import nn
 
-# The first process decodes the data and makes validation pictures while the others wait for it, which PyTorch allows
-# for 10 or 30 minutes. torchrun ends all when one dies, so a long wait hides nothing.
+# The other processes wait while the first one decodes the data and makes validation pictures. PyTorch's default limit
+# is 10 or 30 minutes. torchrun ends all processes when one dies, so a long limit hides no failure.
 PATIENCE = timedelta(days=2)
 
 

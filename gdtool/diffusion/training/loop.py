@@ -46,12 +46,12 @@ class State:
     """Hold everything that changes while training: model, optimiser, averaged weights by name, step and time."""
 
     model: Model
-    optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
+    optimizer: Any  # a torch.optim.Optimizer or optimizer.MuonAndAdam
     average: dict[str, torch.Tensor]
     objective: torch.nn.Module
     step: int = 0
     seconds: float = 0.0
-    skipped: int = 0  # steps in a row
+    skipped: int = 0  # steps in a row whose gradient was not finite
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def losses(
     layout = Layout(b, step.domains, len(step.views))
     n = layout.images // b
 
-    # per object: timestep, whether it is the last one, what is dropped, background
+    # four numbers for each object: timestep, whether it is the last one, what is dropped, background
     dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
     background = torch.tensor(
         [BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device
@@ -151,7 +151,7 @@ def losses(
     clean = model.codec.encode(truth.flatten(0, 2))
     rgba = encode_condition(batch.condition, background)
 
-    # One timestep per object: sampling never sees anything else.
+    # One timestep for all images of an object, as when sampling.
     t = (dice[:, 0] * config.timesteps).long()
     t = torch.where(dice[:, 1] < train.pure_noise, config.timesteps - 1, t).to(device)
     noise = torch.cat([torch.randn(n, *clean.shape[1:], generator=generator) for generator in generators]).to(device)
@@ -176,7 +176,7 @@ def losses(
     snr = (model.alpha[t] / model.sigma[t]).square()
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
-        # decoded and shaded: what light is computed from, of the objects that it is computed for
+        # Only the domains that shading reads are decoded, and only of these objects.
         lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in LIT]
         latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
         directions = view_directions(config)[step.views].to(device)
@@ -214,7 +214,7 @@ def train_step(
         group["lr"] = rate * group["rate"]
     idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
     places, sums = np.arange(len(idx)), {}
-    # Every process takes its share of each part of the batch; its gradients' mean is what the processes agree on.
+    # Every process takes a share of each part of the batch; DDP and FSDP average the gradients over processes.
     if len(idx) < distributed.size():
         raise InputError(
             "batch",
@@ -236,7 +236,7 @@ def train_step(
     sums = distributed.sum_over_processes(sums)
     norm = distributed.local_part(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
     finite = bool(torch.isfinite(norm))
-    if finite:  # a step that is not finite is left out rather than the whole run lost
+    if finite:  # otherwise the step is skipped, so that the weights stay finite
         state.optimizer.step()
     state.skipped = 0 if finite else state.skipped + 1
     state.optimizer.zero_grad(set_to_none=True)

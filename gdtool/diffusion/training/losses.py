@@ -12,8 +12,8 @@ from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANES, SCALARS, decode
 
-SOFTNESS = 0.02  # of the absolute error: its gradient is continuous at 0
-LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
+SOFTNESS = 0.02  # a distance is smoothed below this, so that its gradient is continuous at 0
+LIT = ("normal", "albedo", "roughness", "metallic")  # domains that closed-form shading reads
 
 
 def linear(srgb: torch.Tensor) -> torch.Tensor:

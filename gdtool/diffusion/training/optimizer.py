@@ -8,10 +8,10 @@ from gdtool.core.errors import ResourceError, UsageError
 from gdtool.diffusion.config import TrainConfig
 from gdtool.diffusion.training import distributed
 
-# What reads or writes pixels or labels is no map between features: Muon's authors leave first and last layers to AdamW.
+# Layers that read or write pixels or labels, by name. Muon's authors train first and last layers with AdamW.
 ENDS = ("conv_in", "conv_out", "class_embedding", "time_embedding", "position", "condition_gate", "embed")
 MOMENTS = ("step", "exp_avg", "exp_avg_sq", "momentum_buffer")
-SMALLEST = 32  # rows and columns below which a matrix is left to AdamW
+SMALLEST = 32  # least rows and columns of a matrix that Muon trains
 
 
 class MuonAndAdam:

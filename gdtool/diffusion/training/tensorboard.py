@@ -28,7 +28,7 @@ class Events:
 
     def _at(self, step: int):
         """Return the writer. The first call creates it, and hides older events of this step and later ones."""
-        # A resumed run goes over the steps since its checkpoint again: those of before are purged.
+        # A resumed run repeats the steps since its checkpoint; purge_step hides their earlier events.
         if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
         return self._writer

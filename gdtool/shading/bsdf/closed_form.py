@@ -126,7 +126,7 @@ def _specular(
     overlap = torch.exp(exponent) * cosine_integral(sharpness, dot(axis, normal[..., None, :]))
     by_lobe = (peak * visibility(brdf, roughness, n_v, n_v))[..., None] * overlap
 
-    # The light as a point of its own width: GGX with the light's spread added, times the energy that arrives.
+    # The light as a point: GGX widened by the light's spread, times the energy that arrives.
     half = normalize(view[..., None, :] + lights.axes)
     n_h, v_h = dot(half, normal[..., None, :]), dot(half, view[..., None, :]).clamp(MIN_VIEW_COSINE, 1.0)
     spread = (1 + 1 / (v_h * v_h)) / (4 * light_sharpness.clamp_min(0.1))

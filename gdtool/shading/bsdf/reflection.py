@@ -13,7 +13,7 @@ import numpy as np
 from gdtool.shading.lights.environment import LUMINANCE
 from gdtool.shading.sampling import orthonormal_basis
 
-# The least share of sampled directions that go to the specular lobe: dull points keep some, so weights stay bounded.
+# The least share of directions that are drawn from the specular lobe; some are needed to keep weights bounded.
 MIN_SPECULAR_SHARE = 0.1
 # The least n·v that is shaded. Normal maps may turn a normal away from the eye: such points are shaded as grazing.
 MIN_VIEW_COSINE = 0.02

@@ -41,9 +41,9 @@ ROUGHNESS_LEVELS = (
 )
 # Half vectors drawn from a lobe, where it is sampled.
 LOBE_SAMPLES = 64
-# Normals that are summed for at once: the matrices between the products stay in the cache.
+# Normals of one matrix product, few enough that intermediate matrices stay in the cache.
 NORMALS_AT_ONCE = 64
-# Rows and columns of the table of a lobe's share of light.
+# Rows and columns of lobe_table().
 TABLE_SIDE = 32
 
 
@@ -130,7 +130,7 @@ class IrradianceMap:
         import torch
 
         small = environment.downsampled(64).subdivided(64)
-        # The first and last row are the poles: rows that begin half a step away are 0.7 % off there under a studio.
+        # The first and last row are the poles: with rows that begin half a step away, they err by 0.7 % under a studio.
         theta = np.arange(height) / (height - 1) * np.pi
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
         ring = np.sin(theta)[:, None]
@@ -265,7 +265,7 @@ def filtered_light(pyramid: LightPyramid, roughness: float, side: int, light_sid
     image = (
         _sum_all_texels(pyramid, normal, a2, light_side) if light_side else _sum_lobe_samples(pyramid, normal, a2)
     ).reshape(side, side, 3)
-    # Beyond an edge of the octahedron lies the same edge in reverse order.
+    # Beyond an edge of the octahedral map, the same edge follows in reverse order.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
     return columns.permute(2, 0, 1).contiguous()

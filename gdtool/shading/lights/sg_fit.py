@@ -11,10 +11,10 @@ from gdtool.shading.sampling import fibonacci
 
 # Rows of the image that is fitted.
 ROWS = 32
-# Logarithm of the largest sharpness that pixels of that size can tell from a larger one.
+# Logarithm of the largest sharpness that an image of ROWS rows resolves.
 SHARPEST = float(np.log(250.0))
-# Weight of the squared irradiance error against the squared radiance error. Irradiance makes nearly all of a diffuse
-# color: an error of 1 % there counts like one of about 5 % of the radiance.
+# Weight of the squared irradiance error against the squared radiance error. Diffuse color comes nearly all from
+# irradiance, so an error of 1 % in it counts like about 5 % in the radiance.
 IRRADIANCE_WEIGHT = 30.0
 
 

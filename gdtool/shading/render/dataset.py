@@ -24,7 +24,7 @@ from gdtool.shading.lights.studio import studio
 from gdtool.shading.render.direct import DirectLight
 from gdtool.shading.render.render import Renderer
 
-# The least share of its area on which an object must have textures to count as complete.
+# Least share of an object's area with textures for the object to count as complete.
 MIN_COMPLETE_AREA = 0.95
 # A bounding box is about normalised when its centre and its longest side are off by less than this.
 ABOUT_NORMALISED = 0.1
@@ -156,7 +156,7 @@ def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
     """
     if light == "random" and views is not None:
         used = views.content.environment
-        # A light from an image file is not here to be read again.
+        # The file of another light may be missing here.
         light = used if used.startswith("random:") or used in BUNDLED else light
     if light == "random":
         light = f"random:{(seed_of(name) + seed) % RANDOM_LIGHTS}"
@@ -170,7 +170,7 @@ def prepare_light(renderer: Renderer, light: str, samples: int, seed: int, brdf:
     """
     import torch
 
-    # Shading runs in threads of this program, a chunk each; torch's would only wait for each other.
+    # Chunks of points are shaded in threads of this program; torch's threads would only slow them down.
     torch.set_num_threads(1)
     environment, lobes, record = studio(light, seed)
     return PreparedLight(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))

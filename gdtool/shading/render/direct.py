@@ -29,13 +29,13 @@ from gdtool.shading.sampling import sobol
 if TYPE_CHECKING:
     from gdtool.shading.render.render import Renderer, ShadingPoints
 
-# Directions that are drawn once from the light; each point uses its own run of them.
+# Directions that are drawn once from the light; each point uses a run of them.
 POOL = 1 << 16
 # Pairs of point and direction that are shaded at once: enough that the cost of the calls is small beside them.
 PAIRS = 1 << 17
-# A direction needs this share of the mean brightness of its point's directions for its shadow ray to be certain.
+# A direction with at least this share of the mean brightness of its point's directions always gets a shadow ray.
 ROULETTE_SHARE = 0.5
-# Visible light, as a share of the table's, that is assumed where the directions of a pixel bring next to nothing.
+# Share of the table's light that is added as visible light, so that pixels with next to none in their samples are lit.
 PRIOR = 0.02
 
 # Rows of a point's sums. Each block has the specular sum, its part with the Fresnel weight w, and the diffuse sum; the
@@ -224,7 +224,7 @@ class DirectLight:
             brightness = surface.brightness(terms, luminance).mul_(visible)
             candidates = _Candidates(direction, above, brightness, torch.cat([from_light[7], numbers[3]]))
             counted = self._apply_shadows(points.position[part], surface, candidates, (visible, everything))
-        # Only prefiltered light asks what share of the specular reflection is visible.
+        # Only prefiltered light needs the visible share of the specular reflection.
         split = self.mode == "prefiltered"
         for first_row, weight, used_terms in (
             (VISIBLE, visible, terms),

@@ -32,10 +32,10 @@ BASE_SAMPLES = 4
 # While pixels have at most this many samples, those beside an outline or beside an unresolved pixel get more too: the
 # detail that leaves the neighbour unresolved may pass between their samples.
 OUTLINE_SAMPLES = 8
-# The most alpha-tested layers that a ray passes through; behind them it meets nothing.
+# The most alpha-tested layers that a ray passes through; what is behind them is not hit.
 MAX_LAYERS = 32
 # The standard error of a pixel's mean, in the units a picture stores (sRGB, (n + 1) / 2), above which it gets more
-# samples. Color gets a larger one: its noise costs more to take away.
+# samples. Color has a larger one, since its noise costs more to reduce.
 TOLERANCE = {"normal": 0.009, "albedo": 0.009, "roughness": 0.009, "metallic": 0.009, "color": 0.018}
 # Factor from a value to the units a picture stores; None: the sRGB curve.
 STORED_SCALE = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}

@@ -74,7 +74,7 @@ def _samples(renderer: Renderer, samples: int) -> list[SkippedStep]:
         in_bounds = max(counts.pixels_in_bounds, 1)
         uniform = 1 - counts.pixels_refined / in_bounds
         why = (
-            f"{uniform:.0%} of the pixels in bounds are even and got {BASE_SAMPLES} of {samples}; "
+            f"{uniform:.0%} of the pixels in bounds are uniform and got {BASE_SAMPLES} of {samples}; "
             f"{counts.samples / in_bounds:.1f} on average"
         )
         out.append(SkippedStep("samples", why, float(fewer * counts.seconds.get("samples", 0.0) / taken)))
@@ -95,8 +95,8 @@ def _shadow_rays(renderer: Renderer) -> list[SkippedStep]:
         out.append(SkippedStep("shadow rays of convex objects", why, float(convex * each)))
     if rare:
         why = (
-            f"{rare / directions:.0%} of the directions bring little light and were left out by chance, "
-            "the others counting for more"
+            f"{rare / directions:.0%} of the directions contribute little light and were left out by chance, "
+            "with a larger weight for the others"
         )
         out.append(SkippedStep("shadow rays toward little light", why, float(rare * each)))
     return out

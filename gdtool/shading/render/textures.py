@@ -15,8 +15,8 @@ from gdtool.images.color import linear_from_srgb
 BAND = 256
 # Rows that are decoded at once: few enough that intermediate values stay in the cache.
 CACHED_ROWS = 16
-# Lookups, as a share of the finest level's texels, from which decoding all of it once costs less than decoding texels
-# one by one; and the most float32 numbers that it may have then (256 MB).
+# DECODE_SHARE: lookups, as a share of the finest level's texels, above which it is cheaper to decode the whole level
+# than single texels. MAX_DECODED: most float32 numbers of a level that is decoded whole (256 MB).
 DECODE_SHARE = 0.15
 MAX_DECODED = 1 << 26
 
@@ -82,7 +82,7 @@ class TextureReader:
             None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
         )
         self._lock = threading.Lock()
-        # Lookups of the finest level so far, and all of it decoded once they are many.
+        # Number of lookups of the finest level so far, and that level decoded, once there are many.
         self._lookups, self._decoded = 0, None
 
     @property
