@@ -114,7 +114,7 @@ class _LongHeader(Exception):
 
 
 class _BoundedHeader(tarfile.TarInfo):
-    """Refuse to read the extended parts of a header when they claim to be large."""
+    """Parse the headers of a tar, and refuse extended ones of more than MAX_HEADER_BYTES."""
 
     def _proc_member(self, tar: tarfile.TarFile):
         """Raise _LongHeader for a large extended header, else process it."""

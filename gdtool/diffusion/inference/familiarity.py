@@ -119,8 +119,8 @@ def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.nda
 def usual_ranges(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
     """Compute the usual range of each figure of result_figures() from the figures of many results.
 
-    The upper ends are quantiles, the same for each figure. It is the lowest quantile for which at most the share
-    `alarms` of the results, 0 to 1, lies outside a range.
+    The upper end of a range is a quantile of its figure. The quantile is common to all figures: the lowest for which at
+    most the share `alarms` of the results, 0 to 1, lies outside any range.
     """
     columns = np.array([[figures[name] for name in DOUBTS] for figures in results])  # (n, figures)
     for quantile in np.linspace(1 - alarms, 1, 101):

@@ -1,9 +1,9 @@
 """Add parts that the picture shows, and that the sampled outlines leave no space for, to all views.
 
 The object's outline from the front is that of the picture, and exact. The other outlines are sampled by the model, and
-thin parts (ribbons, arms, spires) fade first in them. A lost part is placed along the rays of the front view where the
-other outlines come nearest to having a common point, and near the front view's depth. It is as thick as it is wide, up
-to a bound.
+thin parts (ribbons, arms, spires) fade first in them. A lost part is placed along the rays of the front view: at the
+depth where the product of the other views' coverage is largest, and near the front view's depth. It is as thick as it
+is wide, up to a bound.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 
 from gdtool.images.detail import DARK, detail_gain, guided, masked_mean
 
-# Contrast of a detail in the model's albedo, relative to that in the color. Below LIGHT the true albedo has next to none
+# Contrast of a detail in the model's albedo, relative to that in the color. Below LIGHT the true albedo has hardly any
 # of the detail, above PAINT all of it; measured on held-out and real models.
 LIGHT, PAINT = 0.3, 0.5
 # WIDTH: pixels around which light is fitted as a linear function of the normal. LEAST: variance of the normals, squared

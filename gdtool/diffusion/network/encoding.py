@@ -107,10 +107,11 @@ def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tens
 
 
 def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor:
-    """Compute the coverage (…, h, w) in [0, 1], as the mean of what encoded domain images (…, 3, h, w) say of it.
+    """Compute the coverage (…, h, w) in [0, 1] from encoded images (…, 3, h, w) by domain, as the mean over domains.
 
-    The third channel of scalar domains and the length of normals give it. Without any of these it is the difference of
-    color (or albedo) from the background, which fails for a subject of the background's color.
+    It is the third channel of scalar domains and the length of normals. Without any of these it is the difference of
+    color (or albedo) from the background, which fails for a subject of the background's color. background: encoded
+    value in [-1, 1].
     """
     votes = [0.5 + 0.5 * images[d][..., 2, :, :] for d in SCALARS if d in images]
     if "normal" in images:
@@ -122,10 +123,11 @@ def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor
 
 
 def decode(images: dict[str, torch.Tensor], mask: torch.Tensor, background: float) -> dict[str, torch.Tensor]:
-    """Decode encoded images (…, 3, h, w) by domain to values, divided by the mask's coverage (…, h, w).
+    """Decode encoded images (…, 3, h, w) by domain to values, divided by the mask's coverage (…, h, w) in [0, 1].
 
-    Returns color and albedo (…, 3, h, w) sRGB in [0, 1], normal (…, 3, h, w) unit, depth (…, h, w) in world units,
-    roughness and metallic (…, h, w) in [0, 1]. Differentiable in images.
+    background: encoded value in [-1, 1] that color and albedo are composited over. Returns color and albedo (…, 3, h,
+    w) sRGB in [0, 1], normal (…, 3, h, w) unit, depth (…, h, w) in world units, roughness and metallic (…, h, w) in [0,
+    1]. Differentiable in images.
     """
     m = mask.clamp_min(0.1)
     out = {}

@@ -105,9 +105,9 @@ def step_cost(
 
     Args:
         config: of the model.
-        domains: how many the pass has.
-        views: how many the pass has.
-        objects: how many the pass has.
+        domains: number of domains.
+        views: number of views.
+        objects: number of objects.
         fused: whether attention uses a fused kernel, as on a GPU; otherwise it runs as attend() does on this device.
         dtype: of weights and activations.
         device: where the pass runs; "meta" computes no values.

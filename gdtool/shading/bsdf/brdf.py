@@ -30,7 +30,10 @@ def alpha_of(roughness: Tensor) -> Tensor:
 
 
 def f0_of(albedo: Tensor, metallic: Tensor, f0: float | Tensor) -> Tensor:
-    """Blend the reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals."""
+    """Blend the reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals.
+
+    albedo (..., 3) linear; metallic (...) in [0, 1]; f0 a number or (..., 1).
+    """
     m = metallic[..., None]
     return f0 * (1 - m) + albedo * m
 

@@ -1,7 +1,7 @@
 """Shade points under spherical Gaussian light in closed form, without shadows; differentiable in every argument.
 
-Diffuse light is the integral of each lobe times the clamped cosine. Specular light is the mean of two estimates with
-weights 1 / (1 + x) and x / (1 + x), x = 2 λ_light r⁴ n·v:
+Diffuse light is the integral of each lobe times the clamped cosine. Specular light is a sum of two estimates, weighted
+by 1 / (1 + x) and x / (1 + x) with x = 2 λ_light r⁴ n·v:
 
 - For light that is broader than the reflection lobe: the product of the light and the lobe, which is taken as a
   spherical Gaussian about the mirror direction (Wang et al. 2009, "All-frequency rendering of dynamic,
@@ -62,9 +62,10 @@ def shade(
 ) -> Tensor:
     """Compute the linear radiance (..., 3) that points reflect toward view.
 
-    normal and view (..., 3) are unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...); f0, the
-    dielectric reflectance, a number or (..., 1). A zero normal gives 0. A view below the horizon is shaded as grazing.
-    Everything broadcasts. More than seven parameters: they are the terms of the formula, each differentiable.
+    normal and view (..., 3) are unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...) in [0, 1];
+    f0, the dielectric reflectance, a number or (..., 1). A zero normal gives 0. A view below the horizon is shaded as
+    grazing. All arguments broadcast. More than seven parameters: they are the terms of the formula, each
+    differentiable.
     """
     diffuse, specular = shade_parts(normal, view, albedo, roughness, metallic, lights, brdf, f0)
     return diffuse + specular

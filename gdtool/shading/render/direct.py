@@ -1,11 +1,11 @@
 """Estimate the direct light of an environment on surface points, with ray-cast shadows.
 
 Directions are drawn from the light and from the reflection, and combined by multiple importance sampling. With
-Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected radiance is a linear combination of four sums over the directions:
-only w depends on the direction. So everything per pair of point and direction is a scalar.
+Schlick's Fresnel, F = f0 + (f90 − f0) w, reflected radiance is a linear combination of four sums over the directions,
+since only w depends on the direction. So all that is computed for a pair of point and direction is scalar.
 
-Unshadowed diffuse light is known without rays and noise: a table has the irradiance. The sampled directions then only
-have to say how much of it is hidden. V is the sum over visible directions, U the sum over all of them, B the table's
+Unshadowed diffuse light needs neither rays nor samples: a table has the irradiance. The sampled directions only have to
+estimate how much of it is hidden. V is the sum over visible directions, U the sum over all of them, B the table's
 value. The estimate is V + β (B − U), a control variate, with β the visible share of U in the pixel. β is near 1 where
 little is hidden and 0 where everything is. The estimate is unbiased for any β that does not depend on the noise.
 """
@@ -295,7 +295,7 @@ class DirectLight:
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
 
         def share(known: list) -> torch.Tensor:
-            """Repeat each pixel's visible share for its points: (n,)."""
+            """Repeat each pixel's visible share for its points: (n,). known: visible, all and tabulated sums (3, n)."""
             return torch.from_numpy(
                 np.repeat(_visible_share(*(x.numpy() for x in known), starts), np.diff(starts, append=len(points)))
             )
