@@ -20,14 +20,14 @@ def convert(source: str, target: str) -> int:
 
     tensors = torch.load(source, map_location="cpu", weights_only=True)
     tensors = tensors.get("state_dict", tensors)
-    kept = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
-    if not kept:
+    weights = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
+    if not weights:
         raise ValueError("holds no tensors")
     partial = partial_of(target)
-    save_file(kept, partial, metadata={"format": "pt"})
+    save_file(weights, partial, metadata={"format": "pt"})
     partial.chmod(0o644)
     partial.replace(target)
-    return len(kept)
+    return len(weights)
 
 
 def partial_of(target: str | Path) -> Path:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
@@ -32,7 +34,7 @@ def orthonormal_basis(x, y, z):
     "Building an Orthonormal Basis, Revisited").
     """
     if isinstance(z, np.ndarray):
-        sign = np.where(z < 0, -1, 1).astype(z.dtype)
+        sign: Any = np.where(z < 0, -1, 1).astype(z.dtype)
     else:
         import torch
 

@@ -146,7 +146,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         )
     images = {d: np.stack([frame[d] for frame in frames]) for d in ALL if d in options.domains}
     with out.step("conditions"):
-        if options.condition_views:
+        if options.condition_views and lamps is not None:
             rng = np.random.default_rng([options.seed, dataset.seed_of(inputs.name)])
             _write_conditions(out, renderer, lamps.direct, options, rng)
     with out.step("write"):

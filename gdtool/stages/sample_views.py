@@ -15,7 +15,8 @@ Example:
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Literal, cast
 
 import msgspec
 from msgspec import Meta
@@ -106,14 +107,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     torch.set_num_threads(out.threads)
     with out.step("load"):
         chosen = inputs.second["model"]
-        folder = getattr(chosen, "path", chosen)
+        folder = cast(Path, getattr(chosen, "path", chosen))
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
     domains = _domains(options, config)
     with out.step("condition"):
         extent = trained_extent(config.convention)
         framing = PictureOptions(options.mask, options.matting, options.crop, extent, config.image_size)
-        condition, picture = make_condition(inputs.main, inputs.name, framing, out.warn)
+        condition, picture = make_condition(cast(Path, inputs.main), inputs.name, framing, out.warn)
     with out.step("sample"):
         settings = SamplingOptions(
             domains=domains,

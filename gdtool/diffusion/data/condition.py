@@ -34,7 +34,7 @@ class PictureOptions:
     size: int
 
 
-def mask_size_error(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
+def mask_size_error(mask: str, size: tuple[int, ...], wanted: tuple[int, ...]) -> InputError:
     """Make the error for a mask whose size (width, height) is not the picture's."""
     return InputError(
         mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}"
@@ -57,9 +57,11 @@ def make_condition(
             f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {LEAST_PIXELS} at least",
             "give a larger picture",
         )
-    mask = read_image(Path(options.mask)) if options.mask is not None else None
-    if mask is not None and mask.shape[:2] != image.shape[:2]:
-        raise mask_size_error(options.mask, mask.shape[1::-1], image.shape[1::-1])
+    mask = None
+    if options.mask is not None:
+        mask = read_image(Path(options.mask))
+        if mask.shape[:2] != image.shape[:2]:
+            raise mask_size_error(options.mask, mask.shape[1::-1], image.shape[1::-1])
     alpha = foreground(image, mask, path, warn, options.matting)
     if not (alpha > 0.5).any():
         raise InputError(path, "shows no subject: its mask is empty", "give one with --mask")

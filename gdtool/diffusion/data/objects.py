@@ -219,7 +219,9 @@ def draw_batch(
 
     generators: one for each object, so that the result does not depend on how a batch is split.
     """
-    planes, rgba, lights = [], [], []
+    planes: list[torch.Tensor] = []
+    rgba: list[torch.Tensor] = []
+    lights: list[torch.Tensor] = []
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0

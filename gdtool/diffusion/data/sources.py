@@ -12,7 +12,7 @@ from gdtool.diffusion.data.archives import object_count, unpack_views
 
 def views_folders(sources: Iterable[Folder | Path], workspace: Path) -> Iterator[Folder]:
     """Yield the views folders of folders, datasets and archives. Those of an archive are unpacked under workspace."""
-    parts = []
+    parts: list[Iterable[Folder]] = []
     for source in sources:
         if isinstance(source, Path):
             parts.append(unpack_views(source, workspace))

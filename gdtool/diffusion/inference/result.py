@@ -73,11 +73,11 @@ def move_depth_within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: 
                 or camera.pixel_size != other.pixel_size
             ):
                 continue
-            shown = (mask[j] > 0.5).any(1)
+            row_covered = (mask[j] > 0.5).any(1)
             first, last = _first_covered_column(mask[j]), width - _first_covered_column(mask[j][:, ::-1])
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
-            lacking = np.clip(column, first[:, None], last[:, None]) - column
-            out[k] += np.where(inside & shown[:, None], lacking / per_depth, 0.0)
+            outside_by = np.clip(column, first[:, None], last[:, None]) - column
+            out[k] += np.where(inside & row_covered[:, None], outside_by / per_depth, 0.0)
         # Contradictory outlines would move points out of the camera's range.
         out[k] = np.where(inside, np.clip(out[k], camera.near, camera.far), out[k])
     return out.astype(np.float32)
@@ -138,7 +138,7 @@ def views_from_images(
         part = find_lost_part(
             soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None
         )
-    if part is not None:
+    if part is not None and front is not None:
         mask = add_part_to_masks(part, mask, cameras, front)
     out = {}
     for domain in images:
@@ -163,7 +163,7 @@ def views_from_images(
             out["albedo"][front], color, mask[front], normal, metallic
         )
         report["painted_share"] = float((share * mask[front]).sum() / max(mask[front].sum(), 1.0))
-    if part is not None:
+    if part is not None and front is not None:
         draw_part(part, out, before, cameras, front)
         report["drawn_share"] = float(part.lost.sum() / (mask[front] > 0.5).sum())
     return Views(cameras, out, mask.astype(np.float32)), report

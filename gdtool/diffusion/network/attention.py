@@ -193,7 +193,9 @@ class TransformerBlock(nn.Module):
             self.add_module(f"attn_joint_{self.joint}", JointAttention(width, heads))
         if cross_domain in ("one_way", "two_way"):
             self.norm_cross_domain = nn.LayerNorm(width)
-            self.attn_cross_domain = CrossDomainAttention(width, heads, cross_domain == "two_way")
+            self.attn_cross_domain: CrossDomainAttention | None = CrossDomainAttention(
+                width, heads, cross_domain == "two_way"
+            )
         else:
             self.attn_cross_domain = None
         self.norm2 = nn.LayerNorm(width)

@@ -117,7 +117,7 @@ def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor
     if "normal" in images:
         votes.append(images["normal"].norm(dim=-3))
     if not votes:
-        image = images.get("color", images.get("albedo"))
+        image = images["color"] if "color" in images else images["albedo"]
         votes = [(image - background).abs().amax(-3) * 2]
     return torch.stack(votes).mean(0).clamp(0, 1)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import nn
@@ -22,6 +23,10 @@ class Model(nn.Module):
     A VAE codec and a CLIP encoder are loaded from config.pretrained and are not saved with the model. codec, encoder:
     replace what the configuration names.
     """
+
+    alpha: torch.Tensor
+    sigma: torch.Tensor
+    labels: torch.Tensor
 
     def __init__(self, config: ModelConfig, codec=None, encoder=None):
         super().__init__()
@@ -82,7 +87,7 @@ def structure(config: ModelConfig, device: str = "meta") -> Model:
     """
     with torch.device(device):
         if config.codec == "vae":
-            codec = SimpleNamespace(side=config.image_size // 8, latent_channels=4, condition_channels=4)
+            codec: Any = SimpleNamespace(side=config.image_size // 8, latent_channels=4, condition_channels=4)
         else:
             codec = PatchCodec(config)
         encoder = PatchEncoder(config) if config.encoder == "patch" else torch.nn.Identity()

@@ -7,6 +7,7 @@ importing it takes three seconds, and its blocks do not know which images belong
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -161,7 +162,7 @@ class UNet(nn.Module):
         self.class_embedding = Embedding(
             WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding
         )
-        common = {"config": config, "embedding": embedding}
+        common: dict[str, Any] = {"config": config, "embedding": embedding}
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
         sides = [side >> i for i in range(len(widths))]

@@ -41,7 +41,7 @@ class LiveBytes(TorchDispatchMode):
     def __init__(self):
         super().__init__()
         self.live = self.peak = 0
-        self.seen: dict[int, int] = {}
+        self.sizes: dict[int, int] = {}
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
         """Run an operation and add the bytes of each storage that it allocates."""
@@ -50,9 +50,9 @@ class LiveBytes(TorchDispatchMode):
         for x in _tensors(out):
             storage = x.untyped_storage()
             key, size = storage._cdata, storage.nbytes()
-            if key in inputs or key in self.seen:  # a view, or written in place
+            if key in inputs or key in self.sizes:  # a view, or written in place
                 continue
-            self.seen[key] = size
+            self.sizes[key] = size
             self.live += size
             self.peak = max(self.peak, self.live)
             weakref.finalize(storage, self._freed, key)
@@ -60,7 +60,7 @@ class LiveBytes(TorchDispatchMode):
 
     def _freed(self, key: int) -> None:
         """Subtract the bytes of a storage that was freed."""
-        self.live -= self.seen.pop(key, 0)
+        self.live -= self.sizes.pop(key, 0)
 
 
 def _tensors(x):

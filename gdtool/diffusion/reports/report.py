@@ -43,9 +43,9 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
         sampled = torch.stack([images[d][0].float().cpu() for d in config.domains])
         errors.append(((sampled - truth)[:, unseen] / 2).square().mean((2, 3, 4)))
         blocks = [_tile(truth), _tile(sampled)]
-        shown = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
-        shown[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
-        rows.append(np.concatenate([shown, *blocks], 1))
+        condition_column = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
+        condition_column[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
+        rows.append(np.concatenate([condition_column, *blocks], 1))
     model.load_state_dict({**model.state_dict(), **current})
     model.train()
     psnr = -10 * torch.stack(errors).clamp(min=1e-10).log10().mean((0, 2))
@@ -58,14 +58,14 @@ def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, flo
     Rows of this step and later ones are removed first, because a resumed run writes them again.
     """
     head = ["step", "seconds", *psnr]
-    kept = []
+    earlier_rows = []
     if path.is_file():
         with path.open(newline="") as file:
-            kept = [row for row in csv.DictReader(file) if int(row["step"]) < step]
+            earlier_rows = [row for row in csv.DictReader(file) if int(row["step"]) < step]
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, head)
         writer.writeheader()
-        writer.writerows(kept)
+        writer.writerows(earlier_rows)
         writer.writerow(
             {"step": step, "seconds": f"{seconds:.1f}"} | {name: f"{value:.3f}" for name, value in psnr.items()}
         )

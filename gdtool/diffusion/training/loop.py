@@ -213,7 +213,8 @@ def train_step(
     for group in state.optimizer.param_groups:
         group["lr"] = rate * group["rate"]
     idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
-    places, sums = np.arange(len(idx)), {}
+    places = np.arange(len(idx))
+    sums: dict[str, float] = {}
     # Every process takes a share of each part of the batch; DDP and FSDP average the gradients over processes.
     if len(idx) < distributed.size():
         raise InputError(
@@ -412,10 +413,10 @@ def _resume_log(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
     A resumed run starts at its checkpoint and writes the later rows again.
     """
     columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
-    kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
+    earlier_rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)
     file.truncate() if file.name != os.devnull else None
     writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
     writer.writeheader()
-    writer.writerows(kept)
+    writer.writerows(earlier_rows)
     return writer

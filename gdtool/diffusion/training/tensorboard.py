@@ -24,7 +24,8 @@ class Events:
             raise ResourceError(
                 "--tensorboard", "needs the package tensorboard", "pip install 'gdtool[tensorboard]', or leave it out"
             ) from None
-        self._open, self._folder, self._writer = SummaryWriter, folder, None
+        self._open, self._folder = SummaryWriter, folder
+        self._writer: SummaryWriter | None = None
 
     def _at(self, step: int):
         """Return the writer. The first call creates it, and hides older events of this step and later ones."""

@@ -13,6 +13,7 @@ by 1 / (1 + x) and x / (1 + x) with x = 2 λ_light r⁴ n·v:
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -152,7 +153,7 @@ def closed_form_image(
     """
     inside = frame["mask"] > 0
     view = -rays(camera)[1][inside]
-    maps = [
+    normal, toward, albedo, roughness, metallic = (
         torch.tensor(x, dtype=torch.float32)
         for x in (
             frame["normal"][inside],
@@ -161,8 +162,10 @@ def closed_form_image(
             frame["roughness"][inside],
             frame["metallic"][inside],
         )
-    ]
+    )
     out = np.zeros((*inside.shape, 3), np.float32)
     with torch.no_grad():
-        out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()
+        out[inside] = shade(
+            normal, toward, albedo, roughness, metallic, lobes.to(torch.float32), cast(Brdf, brdf)
+        ).numpy()
     return out

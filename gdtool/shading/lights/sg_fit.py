@@ -110,20 +110,21 @@ def _start(
     peaks = count // 2
     bright = radiance.sum(1)
     hidden = bright.copy()
-    axes, sharpness = [], []
+    peak_axes: list[np.ndarray] = []
+    peak_sharpness: list[float] = []
     for _ in range(peaks):
         at = int(hidden.argmax())
         near = d @ d[at]
         # As wide as the region above half of the peak.
         region = weight[(near > 0.8) & (bright > 0.5 * bright[at])].sum()
-        axes.append(d[at])
-        sharpness.append(np.clip(2 * np.pi / max(region, 1e-3), 1.0, 500.0))
-        hidden = np.where(near > np.cos(max(2.0 / np.sqrt(sharpness[-1]), 0.25)), 0.0, hidden)
-    even = fibonacci(count - peaks)
-    axes = np.concatenate([np.array(axes).reshape(-1, 3), even])
-    sharpness = np.concatenate([sharpness, np.full(count - peaks, 4.0)])
+        peak_axes.append(d[at])
+        peak_sharpness.append(np.clip(2 * np.pi / max(region, 1e-3), 1.0, 500.0))
+        hidden = np.where(near > np.cos(max(2.0 / np.sqrt(peak_sharpness[-1]), 0.25)), 0.0, hidden)
+    spread = fibonacci(count - peaks)
+    axes = np.concatenate([np.array(peak_axes).reshape(-1, 3), spread])
+    sharpness = np.concatenate([peak_sharpness, np.full(count - peaks, 4.0)])
     nearest = np.array([radiance[(d @ axis).argmax()] for axis in axes])
-    broad = np.array([np.average(radiance, axis=0, weights=weight * np.exp(4 * (d @ axis - 1))) for axis in even])
+    broad = np.array([np.average(radiance, axis=0, weights=weight * np.exp(4 * (d @ axis - 1))) for axis in spread])
     amplitudes = np.concatenate([nearest[:peaks], 0.4 * broad])
     jitter = np.random.default_rng(seed).normal(0, 0.01, axes.shape)
     return axes + jitter, sharpness, np.maximum(amplitudes, 1e-3)

@@ -180,18 +180,19 @@ def render_view(
     renderer: Renderer,
     camera: Camera,
     samples: int,
-    lamps: PreparedLight | None,
+    light: PreparedLight | None,
     domains: tuple[str, ...],
     exposure: float,
 ) -> dict[str, np.ndarray]:
     """Render one view's images (h, w[, c]) by domain; "color" and "closed_form" only where domains has them.
 
-    samples: the most samples of a pixel. lamps: may be None where neither of the two is rendered. exposure: factor on
+    samples: the most samples of a pixel. light: may be None where neither of the two is rendered. exposure: factor on
     color.
     """
-    frame = renderer.buffers(camera, samples, lamps.direct.color(exposure) if "color" in domains else None)
-    if "closed_form" in domains:
+    shade = None if light is None or "color" not in domains else light.direct.color(exposure)
+    frame = renderer.buffers(camera, samples, shade)
+    if light is not None and "closed_form" in domains:
         from gdtool.shading.bsdf.closed_form import closed_form_image
 
-        frame["closed_form"] = closed_form_image(frame, camera, lamps.lobes, lamps.direct.brdf) * exposure
+        frame["closed_form"] = closed_form_image(frame, camera, light.lobes, light.direct.brdf) * exposure
     return frame

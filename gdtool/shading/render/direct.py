@@ -27,6 +27,8 @@ from gdtool.shading.lights.environment import LUMINANCE, Environment
 from gdtool.shading.sampling import sobol
 
 if TYPE_CHECKING:
+    import torch
+
     from gdtool.shading.render.render import Renderer, ShadingPoints
 
 # Directions that are drawn once from the light; each point uses a run of them.
@@ -81,9 +83,9 @@ class _Candidates(NamedTuple):
     """
 
     direction: list
-    above: object
-    brightness: object
-    roulette: object
+    above: torch.Tensor
+    brightness: torch.Tensor
+    roulette: torch.Tensor
 
 
 class DirectLight:
@@ -257,13 +259,13 @@ class DirectLight:
         import torch
 
         direction, above, brightness, roulette = candidates
-        ask = above
-        inner = self.renderer.may_be_hidden(position, surface.geometric.T.numpy())
-        if inner is not None:
-            ask = above & torch.from_numpy(inner)
+        may_be_hidden = above
+        hidden_points = self.renderer.may_be_hidden(position, surface.geometric.T.numpy())
+        if hidden_points is not None:
+            may_be_hidden = above & torch.from_numpy(hidden_points)
         chance = (brightness / (ROULETTE_SHARE * brightness.mean(0)).clamp_min(1e-20)).clamp_max_(1)
-        follow = ask & (roulette < chance)
-        times = torch.where(ask, torch.where(follow, chance.clamp_min_(1e-20).reciprocal_(), 0.0), 1.0)
+        follow = may_be_hidden & (roulette < chance)
+        times = torch.where(may_be_hidden, torch.where(follow, chance.clamp_min_(1e-20).reciprocal_(), 0.0), 1.0)
         for weight in weights:
             weight *= times
         flat = follow.reshape(-1).nonzero()[:, 0]
@@ -271,8 +273,10 @@ class DirectLight:
         origins = surface.offset_origins(position, 2e-4 * self.renderer.extent).index_select(1, flat % n)
         rays = torch.stack([c.reshape(-1).index_select(0, flat) for c in direction])
         weights[0].view(-1)[flat[torch.from_numpy(self.renderer.occluded(origins.numpy().T, rays.numpy().T))]] = 0.0
-        lit, asked = int(above.sum()), int(ask.sum())
-        return _RayCounts(len(flat), above.numel() - lit, lit - asked, asked - len(flat))
+        above_count, may_be_hidden_count = int(above.sum()), int(may_be_hidden.sum())
+        return _RayCounts(
+            len(flat), above.numel() - above_count, above_count - may_be_hidden_count, may_be_hidden_count - len(flat)
+        )
 
     def _compose(self, points: ShadingPoints, sums: np.ndarray) -> np.ndarray:
         """Compose radiance (3, n), without emission, from the points' sums (SUMS, 3, n)."""
@@ -282,7 +286,7 @@ class DirectLight:
 
         from gdtool.shading.bsdf.closed_form import disney_mean, fresnel_loss
 
-        values, sums = points.values, torch.from_numpy(sums)
+        values, totals = points.values, torch.from_numpy(sums)
         albedo, metallic, f0, f90 = (
             rows_of(values["albedo"]),
             *(tensor_of(values[name]) for name in ("metallic", "f0", "f90")),
@@ -290,8 +294,8 @@ class DirectLight:
         f0 = f0 * (1 - metallic) + albedo * metallic
         # How much reflection grows toward grazing: to 1, or to what KHR_materials_specular leaves of a dielectric's.
         growth = f90 * (1 - metallic) + metallic - f0
-        reflect = [f0 * sums[i] + growth * sums[i + 1] for i in (VISIBLE, ALL, KNOWN)]
-        diffuse = [sums[i] for i in (VISIBLE_DIFFUSE, ALL_DIFFUSE, KNOWN_DIFFUSE)]
+        reflect = [f0 * totals[i] + growth * totals[i + 1] for i in (VISIBLE, ALL, KNOWN)]
+        diffuse = [totals[i] for i in (VISIBLE_DIFFUSE, ALL_DIFFUSE, KNOWN_DIFFUSE)]
         starts = np.flatnonzero(np.diff(points.pixel, prepend=-1))
 
         def share(known: list) -> torch.Tensor:
@@ -301,18 +305,18 @@ class DirectLight:
             )
 
         if self.mode == "prefiltered":
-            seen = [1.0, 1.0] if not self.samples else [share(x) for x in (reflect, diffuse)]
+            visible_shares = [1.0, 1.0] if not self.samples else [share(x) for x in (reflect, diffuse)]
             n_v, roughness = (rows_of(values["normal"]) * rows_of(points.view)).sum(0), tensor_of(values["roughness"])
             factor = (
                 1 - f0 - growth * fresnel_loss(n_v) if self.brdf == "gltf" else disney_mean(roughness, n_v.clamp(0, 1))
             )
-            specular, received = reflect[2] * seen[0], diffuse[2] * seen[1] * factor
+            specular, received = reflect[2] * visible_shares[0], diffuse[2] * visible_shares[1] * factor
         else:
             specular, received = reflect[0], diffuse[0]
             if self.brdf == "gltf":
                 if self.control_variate:
                     received = received + share(diffuse) * (diffuse[2] - diffuse[1])
-                received = (1 - f0) * received - growth * sums[VISIBLE_DIFFUSE_FRESNEL]
+                received = (1 - f0) * received - growth * totals[VISIBLE_DIFFUSE_FRESNEL]
         return (specular + (albedo * (1 - metallic) * received).clamp_min_(0)).numpy()
 
 

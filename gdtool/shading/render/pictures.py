@@ -67,8 +67,8 @@ def render_pictures(
         out.psnr.append(renderer.counts.estimated_psnr)
         if shade is None:
             frame["color"] = closed_form_image(frame, camera, light, options.brdf) * options.exposure
-        seen = frame["color"][frame["mask"] > 0]
-        out.clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
+        covered = frame["color"][frame["mask"] > 0]
+        out.clipped.append(float((covered > 1).mean()) if len(covered) else 0.0)
         color = srgb_from_linear(np.clip(frame["color"], 0, 1))
         out.images.append(np.concatenate([color, frame["mask"][..., None]], -1))
     return out

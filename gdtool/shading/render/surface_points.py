@@ -52,7 +52,7 @@ class _SurfacePoints:
     def __len__(self) -> int:
         return len(self.face_idx)
 
-    def part(self, chosen: np.ndarray) -> _SurfacePoints:
+    def part(self, chosen: np.ndarray | slice) -> _SurfacePoints:
         """Return the points with these indices (m,)."""
         return _SurfacePoints(
             self.face_idx[chosen],

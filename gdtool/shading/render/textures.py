@@ -83,7 +83,8 @@ class TextureReader:
         )
         self._lock = threading.Lock()
         # Number of lookups of the finest level so far, and that level decoded, once there are many.
-        self._lookups, self._decoded = 0, None
+        self._lookups = 0
+        self._decoded: np.ndarray | None = None
 
     @property
     def channels(self) -> int:
