@@ -107,7 +107,7 @@ def _fault(config: ModelConfig) -> str | None:
         if unknown:
             return f"{field} names {unknown[0]!r}, which is none of {', '.join(names)}"
         if len(set(values)) < len(values):
-            return f"{field} names one twice"
+            return f"{field} names a value twice"
     levels = len(config.channels)
     for field, values in (("attention_levels", config.attention_levels), ("row_attention", config.row_attention)):
         if len(values) != levels and (values or field == "attention_levels"):

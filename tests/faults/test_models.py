@@ -65,7 +65,7 @@ BAD_FIELDS = [
     ({"timesteps": 1}, r"`int` >= 2 - at `\$.timesteps`"),
     ({"sampling_steps": 0}, r"`int` >= 1 - at `\$.sampling_steps`"),
     ({"views": ["front", "top"]}, "views names 'top', which is none of"),
-    ({"views": ["front", "front"]}, "views names one twice"),
+    ({"views": ["front", "front"]}, "views names a value twice"),
     ({"views": []}, r"length >= 1 - at `\$.views`"),
     ({"domains": ["color", "smell"]}, "domains names 'smell'"),
     ({"domains": []}, r"length >= 1 - at `\$.domains`"),

@@ -116,7 +116,7 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
     state = unet.state_dict()
     for name, tensor in tensors.items():
         if name not in state:
-            raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
+            raise InputError("pretrained weights", f"hold a tensor {name} that this network lacks", OTHER_START)
         target = state[name]
         if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
             grown = torch.zeros_like(target)
@@ -125,7 +125,7 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
         if tensor.shape != target.shape:
             raise InputError(
                 "pretrained weights",
-                f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}",
+                f"tensor {name} has shape {tuple(tensor.shape)}, the network needs {tuple(target.shape)}",
                 OTHER_START,
             )
         state[name] = tensor

@@ -92,7 +92,7 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
         if value != wanted:
             raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
     if not isinstance(unet.attention_head_dim, int):
-        raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
+        raise InputError(path, "has a different number of heads at each level, and Wonder3D the same", OTHER_FOLDER)
     return parse_config(
         {
             "image_size": 8 * unet.sample_size,
@@ -131,8 +131,8 @@ def load(folder: Path):
     if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
         raise InputError(
             folder,
-            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, "
-            "it has no views",
+            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training can start from it, "
+            "but it samples no views",
             "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it",
         )
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):

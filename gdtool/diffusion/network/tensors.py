@@ -64,7 +64,7 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
         if folder == Path(config.pretrained):
             read_tensors(
                 folder / part / "diffusion_pytorch_model.safetensors",  # raises, since the file is missing
-                f"{config.pretrained} is to hold a pipeline as diffusers saves it, with {part}/",
+                f"{config.pretrained} must hold a pipeline as diffusers saves it, with {part}/",
             )
         revision = f" --revision {config.revision}" if config.revision else ""
         raise InputError(
