@@ -33,10 +33,9 @@ def sample_condition(
     rgba = condition_batch(condition)
     strange = describe_unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
     if strange:
-        out.warn(
-            f"{name}: unlike the pictures that this model was trained on, so its views may be poor: {'; '.join(strange)}"
-        )
-    # The memory order that convolutions work in; a twentieth quicker, the same to rounding.
+        figures = "; ".join(strange)
+        out.warn(f"{name}: unlike the pictures that this model was trained on, so its views may be poor: {figures}")
+    # The memory layout that convolutions work in: 5 % faster, the same up to rounding.
     model.unet.to(memory_format=torch.channels_last)
     sample = sample_compiled if compiled else sample_images
     images = sample(model, rgba.to(out.device), options, progress=out.progress)
