@@ -37,7 +37,7 @@ from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.inference.familiarity import (
     DOUBTS,
-    FILE,
+    RANGES_FILE,
     describe_doubts,
     describe_unfamiliar,
     read_ranges,
@@ -95,7 +95,7 @@ def calibrate(model, path: Path, folders: list[Path]) -> None:
     """Write the limits that the share ALARMS of these objects passes to a model folder."""
     reports = [result_of(model, decode_object(folder, model.config)[1][0])[1] for folder in views_folders(folders)]
     folder = open_folder(path, ("model",))
-    write_ranges(path / FILE, read_ranges(path) | usual_ranges(reports, ALARMS))
+    write_ranges(path / RANGES_FILE, read_ranges(path) | usual_ranges(reports, ALARMS))
     (path / MANIFEST).unlink()
     (path / MANIFEST).write_bytes(encode(msgspec.structs.replace(folder.manifest, files=list_files(path))))
 

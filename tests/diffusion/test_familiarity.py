@@ -6,7 +6,7 @@ import pytest
 from gdtool.core.errors import InputError
 from gdtool.diffusion.inference.familiarity import (
     DOUBTS,
-    FILE,
+    RANGES_FILE,
     PictureRange,
     describe_doubts,
     describe_unfamiliar,
@@ -52,10 +52,10 @@ def test_figures_outside_their_range_in_training_are_described(known):
 
 def test_ranges_are_read_from_the_model_folder_if_present(known, tmp_path):
     assert read_ranges(tmp_path) == {}
-    write_ranges(tmp_path / FILE, known)
+    write_ranges(tmp_path / RANGES_FILE, known)
     assert read_ranges(tmp_path) == known
-    (tmp_path / FILE).write_text('{"mean brightness": {"low": "a"}}')
-    with pytest.raises(InputError, match=FILE):
+    (tmp_path / RANGES_FILE).write_text('{"mean brightness": {"low": "a"}}')
+    with pytest.raises(InputError, match=RANGES_FILE):
         read_ranges(tmp_path)
 
 

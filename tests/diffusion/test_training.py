@@ -11,7 +11,7 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.data.objects import (
-    LIGHTS,
+    LIGHT_COUNT,
     Objects,
     draw_batch,
     from_bytes,
@@ -47,7 +47,7 @@ def spheres(count=4, size=16) -> Objects:
         views = sphere_views(seed, size)
         planes.append(planes_from_images(views.images, views.mask))
         conditions.append(planes[-1][0][[0, 1, 2, 12]])
-    light = np.zeros((LIGHTS, 7), np.float32)
+    light = np.zeros((LIGHT_COUNT, 7), np.float32)
     light[:, 2] = 1
     light[:2] = np.concatenate([LIGHT["axes"], np.array(LIGHT["sharpness"])[:, None], LIGHT["amplitudes"]], 1)
     return Objects(
@@ -189,7 +189,7 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
 
 
 def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
-    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    monkeypatch.setattr(optimizer, "MIN_MUON_SIDE", 8)
     whole = train(tmp_path / "a", None, optimizer="muon")
     assert len(whole.optimizer.matrices) > 20
     train(tmp_path / "b", 7, optimizer="muon")
@@ -202,7 +202,7 @@ def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
 
 
 def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
-    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    monkeypatch.setattr(optimizer, "MIN_MUON_SIDE", 8)
     model = Model(MODEL)
     muon = optimizer.make_optimizer(model, msgspec.structs.replace(TRAIN, optimizer="muon", weight_decay=0.0))
     for group in muon.param_groups:

@@ -14,8 +14,8 @@ from gdtool.images.color import linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image
 from gdtool.images.mask import foreground
 
-LEAST_PIXELS = 32  # along the picture's shorter side; the model needs as much detail
-FINEST = 8  # most pixels of picture.png across one pixel of a view
+MIN_PICTURE_SIDE = 32  # along the picture's shorter side; the model needs as much detail
+MAX_FINER = 8  # most pixels of picture.png across one pixel of a view
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,14 @@ def make_condition(
     """Read a picture, cut its subject out and frame it, at the model's size and at about the picture's resolution.
 
     Returns two images of the same square: (size, size, 4) and (f size, f size, 4), float32, linear color and straight
-    alpha. The whole number f, 1 to FINEST, keeps the picture's resolution best. warn: called with a text where the
+    alpha. The whole number f, 1 to MAX_FINER, keeps the picture's resolution best. warn: called with a text where the
     subject may be cut off. Raises InputError for a picture without a usable subject.
     """
     image = read_image(path)
-    if min(image.shape[:2]) < LEAST_PIXELS:
+    if min(image.shape[:2]) < MIN_PICTURE_SIDE:
         raise InputError(
             path,
-            f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {LEAST_PIXELS} at least",
+            f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {MIN_PICTURE_SIDE} at least",
             "give a larger picture",
         )
     mask = None
@@ -81,7 +81,7 @@ def make_condition(
     finer = (framed_side(rgba, extent) if options.crop else max(rgba.shape[:2])) / size
     condition, picture = (
         frame(rgba, side, extent) if options.crop else whole_frame(rgba, side)
-        for side in (size, size * min(max(round(finer), 1), FINEST))
+        for side in (size, size * min(max(round(finer), 1), MAX_FINER))
     )
     return condition, picture
 

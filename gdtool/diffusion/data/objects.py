@@ -22,7 +22,7 @@ from gdtool.core.reading import read_json
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANE_COUNT, PLANES, mirrored_order, planes_from_images
 
-LIGHTS = 16
+LIGHT_COUNT = 16
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,10 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
             # Centred and as large as in the front view, as a picture is framed when sampling.
             conditions.append(condition_plane(frame(image, size, extent)))
     conditions = [shrink(c, size) for c in conditions]
-    light = np.zeros((LIGHTS, 7), np.float32)
+    light = np.zeros((LIGHT_COUNT, 7), np.float32)
     if views.light is not None:
         rows = np.concatenate([views.light["axes"], views.light["sharpness"][:, None], views.light["amplitudes"]], 1)
-        light[: len(rows)] = rows[:LIGHTS]
+        light[: len(rows)] = rows[:LIGHT_COUNT]
     light[:, 2] += (light[:, :3] == 0).all(1)  # an unused light still needs a unit axis
     return shrink(planes, size), np.stack(conditions), light
 
@@ -156,7 +156,7 @@ def decode_dataset(
     files = {
         "planes": ((k, PLANE_COUNT, h, h), np.uint8),
         "conditions": ((conditions, 4, h, h), np.uint8),
-        "lights": ((LIGHTS, 7), np.float32),
+        "lights": ((LIGHT_COUNT, 7), np.float32),
     }
     if not names_file.is_file():
         arrays = {

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-FILE = "pictures.json"  # in a model folder
+RANGES_FILE = "pictures.json"  # in a model folder
 TAIL = 0.005  # share of the training pictures left out at each end
 MARGIN = 0.1  # of the range, added at each end
 # Figures of a result (result_figures), and the text of a warning with its value and its usual maximum.
@@ -149,7 +149,7 @@ def read_ranges(folder: Path) -> dict[str, PictureRange]:
     from gdtool.core.errors import InputError
     from gdtool.core.reading import read_json
 
-    path = Path(folder) / FILE
+    path = Path(folder) / RANGES_FILE
     if not path.exists():
         return {}
     try:

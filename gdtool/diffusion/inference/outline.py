@@ -15,15 +15,15 @@ import numpy as np
 from gdtool.cameras import Camera, backproject, project
 from gdtool.images.sampling import bilinear
 
-LEAST_WIDTH_PX = 2  # least width of a lost part; narrower gaps are errors of the outlines
+MIN_WIDTH_PX = 2  # least width of a lost part; narrower gaps are errors of the outlines
 OVERLAP_PX = 2  # pixels of the object around a part that are drawn with it, to join the two
 DEPTH_SIGMA = 0.08  # world units: standard deviation of the front view's depth
-FAINT = 0.02  # least coverage in a logarithm
+MIN_COVERAGE = 0.02  # least coverage in a logarithm
 PLACE_BLUR_PX = 1.5  # Gaussian blur of a part's depth
-THIN, THICK = 1.0, 3.0  # pixels: least and most half thickness of a part
-RANGE = 0.75  # world units to either side of the origin that are searched for a part
-PER_PIXEL = 2  # candidate depths per pixel size
-LEAST_FACING = 0.2  # least cosine between a drawn normal and the direction to the camera
+MIN_HALF_PX, MAX_HALF_PX = 1.0, 3.0  # pixels: least and most half thickness of a part
+SEARCH_RANGE = 0.75  # world units to either side of the origin that are searched for a part
+DEPTHS_PER_PIXEL = 2  # candidate depths per pixel size
+MIN_FACING_COSINE = 0.2  # least cosine between a drawn normal and the direction to the camera
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,22 @@ def find_lost_part(
     pixel = camera.pixel_size
     row, column = np.nonzero(covered)
     origin = float(np.linalg.norm(camera.position))
-    places = origin + np.arange(-RANGE, RANGE, pixel / PER_PIXEL)
+    places = origin + np.arange(-SEARCH_RANGE, SEARCH_RANGE, pixel / DEPTHS_PER_PIXEL)
     start = backproject(camera, np.zeros(covered.shape))[row, column]
     points = (start[:, None] - places[None, :, None] * camera.backward).reshape(-1, 3)
     least, score = np.ones(len(points)), np.zeros(len(points))
     for k in side_views:
         pixels = project(cameras[k], points)[0]
         least = np.minimum(least, bilinear(mask[k][..., None], pixels)[:, 0])
-        score += np.log(np.maximum(bilinear(gaussian_filter(soft[k], 1.0)[..., None], pixels)[:, 0], FAINT))
+        score += np.log(np.maximum(bilinear(gaussian_filter(soft[k], 1.0)[..., None], pixels)[:, 0], MIN_COVERAGE))
     least, score = least.reshape(len(row), -1), score.reshape(len(row), -1)
     lost = np.zeros(covered.shape, bool)
     lost[row, column] = least.max(1) <= 0.5
-    lost = binary_opening(lost, np.ones((LEAST_WIDTH_PX, LEAST_WIDTH_PX)))
+    lost = binary_opening(lost, np.ones((MIN_WIDTH_PX, MIN_WIDTH_PX)))
     if not lost.any():
         return None
     edge_distance = distance_transform_edt(covered) - 0.5  # distance of the pixel's centre
-    half = np.clip(edge_distance, THIN, THICK) * pixel
+    half = np.clip(edge_distance, MIN_HALF_PX, MAX_HALF_PX) * pixel
     if depth is not None:
         score -= 0.5 * ((places - (depth + half)[row, column][:, None]) / DEPTH_SIGMA) ** 2
     place, has_depth = np.zeros(covered.shape), np.zeros(covered.shape)
@@ -143,7 +143,7 @@ def _project_part(
     index (m,) of the part's pixel that is seen there.
     """
     camera = cameras[known_view]
-    steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * PER_PIXEL + 1)
+    steps = np.linspace(-1.0, 1.0, 2 * int(np.ceil(part.half.max() / camera.pixel_size)) * DEPTHS_PER_PIXEL + 1)
     start = backproject(camera, np.zeros(shape))[part.row, part.column]
     places = part.middle[:, None] + part.half[:, None] * steps
     points = start[:, None] - places[..., None] * camera.backward
@@ -156,7 +156,7 @@ def _project_part(
     chosen = np.flatnonzero(in_image)[order][first]
     source, across = chosen // len(steps), steps[chosen % len(steps)][:, None]
     normal = part.outward[source] * np.sqrt(1 - across**2) - across * camera.backward
-    normal += cameras[k].backward * np.maximum(LEAST_FACING - normal @ cameras[k].backward, 0.0)[:, None]
+    normal += cameras[k].backward * np.maximum(MIN_FACING_COSINE - normal @ cameras[k].backward, 0.0)[:, None]
     return (
         flat // shape[1],
         flat % shape[1],

@@ -13,12 +13,12 @@ import numpy as np
 
 from gdtool.images.detail import DARK, detail_gain, guided, masked_mean
 
-# Contrast of a detail in the model's albedo, relative to that in the color. Below LIGHT the true albedo has hardly any
-# of the detail, above PAINT all of it; measured on held-out and real models.
-LIGHT, PAINT = 0.3, 0.5
-# WIDTH: pixels around which light is fitted as a linear function of the normal. LEAST: variance of the normals, squared
-# units, that counts as none in that fit.
-WIDTH, LEAST = 6.0, 0.005
+# Contrast of a detail in the model's albedo, relative to that in the color. Below LIGHT_CONTRAST the true albedo has
+# hardly any of the detail, above PAINT_CONTRAST all of it; measured on held-out and real models.
+LIGHT_CONTRAST, PAINT_CONTRAST = 0.3, 0.5
+# Light is fitted as a linear function of the normal: width of the fit in pixels, and what is added to the normals'
+# variance, so that normals which hardly vary explain little.
+FIT_WIDTH_PX, MIN_NORMAL_VARIANCE = 6.0, 0.005
 
 
 def restore_albedo_contrast(
@@ -35,15 +35,17 @@ def restore_albedo_contrast(
     albedo, and how far each pixel (h, w) was changed, 0 to 1.
     """
     log_color, log_albedo = (np.log(np.clip(image, 0, None) + DARK, dtype=np.float64) for image in (color, albedo))
-    gain = np.clip((detail_gain(log_color, log_albedo, mask) - LIGHT) / (PAINT - LIGHT), 0, 1)
+    gain = np.clip(
+        (detail_gain(log_color, log_albedo, mask) - LIGHT_CONTRAST) / (PAINT_CONTRAST - LIGHT_CONTRAST), 0, 1
+    )
     share = np.where(mask > 0, gain * gain * (3 - 2 * gain), 0) * (1 if metallic is None else 1 - metallic)
     if not share.any():
         return albedo, share
     factor = log_albedo - log_color
     factor = (
-        masked_mean(factor, mask, WIDTH / 2)
+        masked_mean(factor, mask, FIT_WIDTH_PX / 2)
         if normal is None
-        else guided(factor, normal.astype(np.float64), mask, WIDTH, LEAST)
+        else guided(factor, normal.astype(np.float64), mask, FIT_WIDTH_PX, MIN_NORMAL_VARIANCE)
     )
     return np.clip(np.exp(log_albedo + share[..., None] * (log_color + factor - log_albedo)) - DARK, 0, 1).astype(
         np.float32

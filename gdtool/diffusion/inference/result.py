@@ -14,17 +14,17 @@ from gdtool.folders.views import Views
 
 # Sampled coverage at which outlines overlap the true ones most, at no cost in color; at one half they cover 4 % too
 # little.
-OUTLINE = 0.45
+OUTLINE_COVERAGE = 0.45
 # Power that the odds of metallic are raised to. Above 3 it makes no difference on held-out objects; edges stay soft.
 METALLIC_POWER = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
-    """Double the slope of sampled coverage (…, h, w), 0 to 1, around the value OUTLINE.
+    """Double the slope of sampled coverage (…, h, w), 0 to 1, around the value OUTLINE_COVERAGE.
 
     Coverage is soft where the model is unsure of the outline, but a real outline is one pixel wide.
     """
-    return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
+    return ((mask - OUTLINE_COVERAGE) * 2 + 0.5).clamp(0, 1)
 
 
 def sharpen_metallic(metallic: torch.Tensor) -> torch.Tensor:

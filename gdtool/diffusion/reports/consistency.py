@@ -11,9 +11,9 @@ import numpy as np
 from gdtool.cameras import project, rays
 from gdtool.folders.views import Views
 
-INSIDE = 0.99  # coverage of a pixel whose value is not mixed with the background
-EDGE = 0.05  # world units: a larger difference in depth between neighbours is an edge and no slope
-SEEN = 0.1  # world units: a point further behind the surface that another view sees is hidden from it
+FULL_COVERAGE = 0.99  # coverage of a pixel whose value is not mixed with the background
+DEPTH_EDGE = 0.05  # world units: a larger difference in depth between neighbours is an edge and no slope
+HIDDEN_DISTANCE = 0.1  # world units: a point further behind the surface that another view sees is hidden from it
 
 
 def consistency(views: Views) -> dict[str, float]:
@@ -46,7 +46,7 @@ def rerendered_psnr(views: Views, count: int = 4000, seed: int = 0) -> float:
     from gdtool.shading.bsdf.closed_form import shade
     from gdtool.shading.bsdf.sg import SphericalGaussians
 
-    inside = views.mask > INSIDE
+    inside = views.mask > FULL_COVERAGE
     toward = (
         np.stack([c.backward for c in views.cameras])[:, None, None]
         .repeat(inside.shape[1], 1)
@@ -77,13 +77,13 @@ def slope_degrees(views: Views) -> float:
     angles = []
     for k, camera in enumerate(views.cameras):
         points = _points(camera, views.images["depth"][k])
-        inside, depth = views.mask[k] > INSIDE, views.images["depth"][k]
+        inside, depth = views.mask[k] > FULL_COVERAGE, views.images["depth"][k]
         along, across = points[1:-1, 2:] - points[1:-1, :-2], points[:-2, 1:-1] - points[2:, 1:-1]
         normal = np.cross(along, across)
         normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
         good = inside[1:-1, 1:-1] & inside[1:-1, 2:] & inside[1:-1, :-2] & inside[2:, 1:-1] & inside[:-2, 1:-1]
-        good &= (np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]) < EDGE) & (
-            np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]) < EDGE
+        good &= (np.abs(depth[1:-1, 2:] - depth[1:-1, :-2]) < DEPTH_EDGE) & (
+            np.abs(depth[2:, 1:-1] - depth[:-2, 1:-1]) < DEPTH_EDGE
         )
         cosine = (normal * views.images["normal"][k][1:-1, 1:-1]).sum(-1)[good]
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
@@ -94,13 +94,13 @@ def slope_degrees(views: Views) -> float:
 def reprojection(views: Views) -> tuple[float, float]:
     """Project each view's points into the other views and compare depth: median difference, and share within 0.02.
 
-    Differences are along the other camera's axis, in world units. A point that lies more than SEEN behind the other
-    view's surface is hidden there and left out. A point over the other view's background counts as SEEN. A point in
-    front of the surface counts with its difference.
+    Differences are along the other camera's axis, in world units. A point that lies more than HIDDEN_DISTANCE behind
+    the other view's surface is hidden there and left out. A point over the other view's background counts as
+    HIDDEN_DISTANCE. A point in front of the surface counts with its difference.
     """
     distances = []
     for i, camera in enumerate(views.cameras):
-        inside = views.mask[i] > INSIDE
+        inside = views.mask[i] > FULL_COVERAGE
         points = _points(camera, views.images["depth"][i])[inside]
         for j, other in enumerate(views.cameras):
             if i == j:
@@ -109,11 +109,11 @@ def reprojection(views: Views) -> tuple[float, float]:
             column, row = (
                 np.clip(xy[:, a].astype(int), 0, size - 1) for a, size in ((0, other.width), (1, other.height))
             )
-            there = views.mask[j][row, column] > INSIDE
-            outside = views.mask[j][row, column] < 1 - INSIDE
+            there = views.mask[j][row, column] > FULL_COVERAGE
+            outside = views.mask[j][row, column] < 1 - FULL_COVERAGE
             behind = depth - views.images["depth"][j][row, column]
-            distances.append(np.full(int(outside.sum()), SEEN))
-            distances.append(np.abs(behind[there & (behind < SEEN)]))
+            distances.append(np.full(int(outside.sum()), HIDDEN_DISTANCE))
+            distances.append(np.abs(behind[there & (behind < HIDDEN_DISTANCE)]))
     every = np.concatenate(distances)
     return (float(np.median(every)), float((every < 0.02).mean())) if len(every) else (float("nan"), float("nan"))
 

@@ -24,7 +24,7 @@ from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import alpha_and_sigma
-from gdtool.diffusion.training.losses import LIT, LitObject, rendering_error, view_directions
+from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
@@ -226,7 +226,7 @@ def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> fl
 
     domains: how many a step has; with less than all of them there is no rendering loss.
     """
-    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
+    lit = {DOMAINS.index(d) for d in SHADED_DOMAINS} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
         config.domains
     )
     if not lit or train.pbr_weight == 0:
@@ -238,10 +238,10 @@ def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> fl
 
 def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
     """Measure the peak bytes of one object's rendering loss, with the decoded images of `views` views."""
-    shape = (len(LIT), views, 3, config.image_size, config.image_size)
+    shape = (len(SHADED_DOMAINS), views, 3, config.image_size, config.image_size)
     planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
     lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
-    order = {DOMAINS.index(d): j for j, d in enumerate(LIT)}
+    order = {DOMAINS.index(d): j for j, d in enumerate(SHADED_DOMAINS)}
     memory, start = LiveBytes(), torch.rand(shape)
     with memory:
         predicted = start.clone().requires_grad_()
@@ -331,7 +331,7 @@ def phase_cost(
         ("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0
     )
     encoding = frozen_figures["encode"] * (domains * views + conditions)
-    decoding = frozen_figures["decode"] * share * len(LIT) * views
+    decoding = frozen_figures["decode"] * share * len(SHADED_DOMAINS) * views
     growing = data + network + rendering
     held = max(data + frozen_figures["encode_bytes"], growing + (frozen_figures["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0

@@ -81,7 +81,7 @@ def write_results(
         for i in every
         for k in range(min(PICTURES_EACH, objects.conditions.shape[1]))
     )
-    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.figure_ranges(pictures))
+    familiarity.write_ranges(out.path(familiarity.RANGES_FILE), familiarity.figure_ranges(pictures))
     facts = {
         "objects": order.used,
         "steps": state.step,

@@ -24,7 +24,7 @@ from torch import nn
 
 # The other processes wait while the first one decodes the data and makes validation pictures. PyTorch's default limit
 # is 10 or 30 minutes. torchrun ends all processes when one dies, so a long limit hides no failure.
-PATIENCE = timedelta(days=2)
+GROUP_TIMEOUT = timedelta(days=2)
 
 
 def size() -> int:
@@ -40,7 +40,7 @@ def rank() -> int:
 def start() -> None:
     """Join the process group, where torchrun started several processes and this one has not joined yet."""
     if int(os.environ.get("WORLD_SIZE", "1")) > 1 and not dist.is_initialized():
-        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=PATIENCE)
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo", timeout=GROUP_TIMEOUT)
         if torch.cuda.is_available():
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
 

@@ -34,7 +34,7 @@ from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training import distributed
-from gdtool.diffusion.training.losses import LIT, LitObject, image_error, rendering_error, view_directions
+from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, image_error, rendering_error, view_directions
 from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -177,7 +177,7 @@ def losses(
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
         # Only the domains that shading reads are decoded, and only of these objects.
-        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in LIT]
+        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in SHADED_DOMAINS]
         latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
         directions = view_directions(config)[step.views].to(device)
         order = {step.domains[j]: place for place, j in enumerate(lit)}

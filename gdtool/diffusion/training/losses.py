@@ -12,8 +12,8 @@ from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANES, SCALARS, decode
 
-SOFTNESS = 0.02  # a distance is smoothed below this, so that its gradient is continuous at 0
-LIT = ("normal", "albedo", "roughness", "metallic")  # domains that closed-form shading reads
+SMOOTHED_BELOW = 0.02  # a distance is smoothed below this, so that its gradient is continuous at 0
+SHADED_DOMAINS = ("normal", "albedo", "roughness", "metallic")  # domains that closed-form shading reads
 
 
 def linear(srgb: torch.Tensor) -> torch.Tensor:
@@ -33,10 +33,10 @@ def image_error(
     """Compute the weighted and the squared error of latents (b d k, c, h, w), as means (b, d) by object and domain.
 
     train.domain_weights multiply the values of each domain; the coverage in a scalar domain's third channel has weight
-    1. In the domains of train.absolute_domains the error of a value is its distance from the truth, which for a normal
-    is taken over its three axes and smoothed below SOFTNESS (Charbonnier's loss). In the others it is the square of the
-    distance. A VAE's latents have no channel of coverage and are weighted as a whole. The second result is the plain
-    squared error, without weights.
+    1. In the domains of train.absolute_domains the error of a value is its distance from the truth, smoothed below
+    SMOOTHED_BELOW (Charbonnier's loss); the distance of a normal is taken over its three axes. In the others the error
+    is the square of the distance. A VAE's latents have no channel of coverage and are weighted as a whole. The second
+    result is the plain squared error, without weights.
     """
     square = (predicted - clean).float().square()
     if config.codec != "patch":
@@ -47,7 +47,7 @@ def image_error(
     for j, i in enumerate(domains):
         value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
         if DOMAINS[i] in train.absolute_domains:
-            value = ((value.mean(2, keepdim=True) + SOFTNESS**2).sqrt() - SOFTNESS).expand_as(value)
+            value = ((value.mean(2, keepdim=True) + SMOOTHED_BELOW**2).sqrt() - SMOOTHED_BELOW).expand_as(value)
         weighted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
     return torch.stack(weighted, 1), square.flatten(2).mean(2)
 
@@ -103,7 +103,7 @@ def rendering_error(
         """Shade the chosen pixels of images (d, k, 3, h, w); returns c / (1 + c) of their radiance c, (pixels, 3)."""
         picked = images[:, k, :, row, column].transpose(0, 1)  # (d, pixels, 3)
         values = decode(
-            {d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT},
+            {d: picked[order[DOMAINS.index(d)]][..., None, None] for d in SHADED_DOMAINS},
             mask[k, row, column][:, None, None],
             scene.background,
         )

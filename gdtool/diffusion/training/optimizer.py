@@ -9,9 +9,17 @@ from gdtool.diffusion.config import TrainConfig
 from gdtool.diffusion.training import distributed
 
 # Layers that read or write pixels or labels, by name. Muon's authors train first and last layers with AdamW.
-ENDS = ("conv_in", "conv_out", "class_embedding", "time_embedding", "position", "condition_gate", "embed")
+FIRST_AND_LAST_LAYERS = (
+    "conv_in",
+    "conv_out",
+    "class_embedding",
+    "time_embedding",
+    "position",
+    "condition_gate",
+    "embed",
+)
 MOMENTS = ("step", "exp_avg", "exp_avg_sq", "momentum_buffer")
-SMALLEST = 32  # least rows and columns of a matrix that Muon trains
+MIN_MUON_SIDE = 32  # least rows and columns of a matrix that Muon trains
 
 
 class MuonAndAdam:
@@ -77,8 +85,8 @@ def make_optimizer(model: torch.nn.Module, train: TrainConfig):
     for name, p in model.named_parameters():
         inner = (
             p.ndim >= 2
-            and min(p.shape[0], p[0].numel()) >= SMALLEST
-            and not any(end in name.split(".") for end in ENDS)
+            and min(p.shape[0], p[0].numel()) >= MIN_MUON_SIDE
+            and not any(end in name.split(".") for end in FIRST_AND_LAST_LAYERS)
         )
         if train.optimizer == "muon" and inner:
             matrices.append(p)

@@ -11,7 +11,7 @@ from gdtool.shading.lights.environment import Environment
 from gdtool.shading.sampling import fibonacci
 
 BUNDLED = ("dark", "mid", "bright")
-COUNT = 16  # lobes of a fitted or random light, as in the paper
+LOBE_COUNT = 16  # lobes of a fitted or random light, as in the paper
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:

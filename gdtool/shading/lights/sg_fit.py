@@ -5,21 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from gdtool.shading.bsdf.sg import SphericalGaussians
-from gdtool.shading.lights.bundled import COUNT
+from gdtool.shading.lights.bundled import LOBE_COUNT
 from gdtool.shading.lights.environment import Environment
 from gdtool.shading.sampling import fibonacci
 
 # Rows of the image that is fitted.
-ROWS = 32
-# Logarithm of the largest sharpness that an image of ROWS rows resolves.
-SHARPEST = float(np.log(250.0))
+FIT_ROWS = 32
+# Logarithm of the largest sharpness that an image of FIT_ROWS rows resolves.
+MAX_LOG_SHARPNESS = float(np.log(250.0))
 # Weight of the squared irradiance error against the squared radiance error. Diffuse color comes nearly all from
 # irradiance, so an error of 1 % in it counts like about 5 % in the radiance.
 IRRADIANCE_WEIGHT = 30.0
 
 
 def fit_sg(
-    environment: Environment, count: int = COUNT, seed: int = 0, steps: int = 300
+    environment: Environment, count: int = LOBE_COUNT, seed: int = 0, steps: int = 300
 ) -> tuple[SphericalGaussians, dict[str, float]]:
     """Fit count lobes to an environment's radiance; also returns the fit's errors, by name as fit_error() gives them.
 
@@ -30,7 +30,7 @@ def fit_sg(
     """
     import torch
 
-    small = environment.downsampled(ROWS)
+    small = environment.downsampled(FIT_ROWS)
     d = small.directions.reshape(-1, 3)
     weight = np.repeat(small.solid_angles, small.image.shape[1])
     radiance = small.image.reshape(-1, 3).astype(np.float64)
@@ -55,7 +55,7 @@ def fit_sg(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(steps):
         axis = torch.nn.functional.normalize(parameters[0], dim=1)
-        s, amplitude = parameters[1].clamp(-1.0, SHARPEST).exp(), parameters[2].clamp(-12.0, 12.0).exp()
+        s, amplitude = parameters[1].clamp(-1.0, MAX_LOG_SHARPNESS).exp(), parameters[2].clamp(-12.0, 12.0).exp()
         fitted = torch.exp(s * (directions @ axis.T - 1)) @ amplitude
         loss = (area[:, None] * (torch.sqrt(fitted + 0.01) - torch.sqrt(target + 0.01)) ** 2).sum()
         loss = loss + IRRADIANCE_WEIGHT * ((transport @ fitted - irradiance) ** 2).mean() / (irradiance**2).mean()
@@ -67,7 +67,7 @@ def fit_sg(
         axis = torch.nn.functional.normalize(parameters[0], dim=1)
         lobes = SphericalGaussians(
             axis.double(),
-            parameters[1].clamp(-1.0, SHARPEST).exp().double(),
+            parameters[1].clamp(-1.0, MAX_LOG_SHARPNESS).exp().double(),
             parameters[2].clamp(-12, 12).exp().double() * mean,
         )
     return lobes, fit_error(environment, lobes)
@@ -83,7 +83,7 @@ def fit_error(environment: Environment, lobes: SphericalGaussians) -> dict[str, 
 
     from gdtool.shading.bsdf.sg import cosine_integral, evaluate
 
-    small = environment.downsampled(ROWS)
+    small = environment.downsampled(FIT_ROWS)
     d = torch.tensor(small.directions.reshape(-1, 3), dtype=torch.float64)
     weight = torch.tensor(np.repeat(small.solid_angles, small.image.shape[1]), dtype=torch.float64)[:, None]
     truth = torch.tensor(small.image.reshape(-1, 3), dtype=torch.float64)

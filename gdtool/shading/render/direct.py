@@ -32,20 +32,20 @@ if TYPE_CHECKING:
     from gdtool.shading.render.render import Renderer, ShadingPoints
 
 # Directions that are drawn once from the light; each point uses a run of them.
-POOL = 1 << 16
+POOL_SIZE = 1 << 16
 # Pairs of point and direction that are shaded at once: enough that the cost of the calls is small beside them.
-PAIRS = 1 << 17
+PAIRS_AT_ONCE = 1 << 17
 # A direction with at least this share of the mean brightness of its point's directions always gets a shadow ray.
 ROULETTE_SHARE = 0.5
 # Share of the table's light that is added as visible light, so that pixels with next to none in their samples are lit.
-PRIOR = 0.02
+VISIBLE_PRIOR = 0.02
 
 # Rows of a point's sums. Each block has the specular sum, its part with the Fresnel weight w, and the diffuse sum; the
 # first has the diffuse sum's part with w as well.
 VISIBLE, VISIBLE_DIFFUSE, VISIBLE_DIFFUSE_FRESNEL = 0, 2, 3  # over the directions that nothing hides
 ALL, ALL_DIFFUSE = 4, 6  # over all directions
 KNOWN, KNOWN_DIFFUSE = 7, 9  # from tables, without directions
-SUMS = 10
+SUM_ROWS = 10
 
 
 @dataclass(frozen=True)
@@ -127,12 +127,12 @@ class DirectLight:
                 else None
             )
             if self.samples:
-                directions, radiance, density = environment.sample(sobol(POOL, 2, seed))
-                roulette = np.random.default_rng(seed).random(POOL)
+                directions, radiance, density = environment.sample(sobol(POOL_SIZE, 2, seed))
+                roulette = np.random.default_rng(seed).random(POOL_SIZE)
                 # Channels of the light's pool: x, y, z, red, green, blue, density, roulette number; of the
                 # reflection's: three numbers for PointReflection.sample, and a roulette number.
                 self.pool = self._as_runs(*directions.T, *radiance.T, density, roulette)
-                self.pattern = self._as_runs(*sobol(POOL, 3, seed + 1).T, roulette)
+                self.pattern = self._as_runs(*sobol(POOL_SIZE, 3, seed + 1).T, roulette)
             self.pixels = tensor_of(
                 np.concatenate([environment.image.reshape(-1, 3), environment.pdf.reshape(-1, 1)], 1)
             )
@@ -140,7 +140,7 @@ class DirectLight:
             self.prefiltered = None if prefiltered is None else prefiltered.result()
 
     def _as_runs(self, *values: np.ndarray):
-        """Cut c arrays (POOL,) into runs of k = samples numbers: a tensor (k, c, POOL / k)."""
+        """Cut c arrays (POOL_SIZE,) into runs of k = samples numbers: a tensor (k, c, POOL_SIZE / k)."""
         return tensor_of(np.stack(values).reshape(len(values), -1, self.samples).transpose(2, 0, 1))
 
     def color(self, exposure: float = 1.0) -> Callable[[ShadingPoints], dict[str, np.ndarray]]:
@@ -150,8 +150,8 @@ class DirectLight:
     def radiance(self, points: ShadingPoints) -> np.ndarray:
         """Estimate the linear radiance (n, 3) of n points toward the eye, emission included."""
         k = self.samples
-        step = max(1, PAIRS // max(2 * k, 2))
-        sums = np.zeros((SUMS, 3, len(points)), np.float32)
+        step = max(1, PAIRS_AT_ONCE // max(2 * k, 2))
+        sums = np.zeros((SUM_ROWS, 3, len(points)), np.float32)
         runs = self._choose_runs(points) if k else None
         if self.mode == "prefiltered" and len(points):
             from gdtool.shading.lights.prefilter import lobe_roughness
@@ -186,15 +186,17 @@ class DirectLight:
         two, four or eight of them. A hash of the pixel's index chooses the block of runs and the first run in it.
         """
         k = self.samples
-        block = min(1 << max(0, points.per_pixel - 1).bit_length(), max(1, POOL // k // 16))
+        block = min(1 << max(0, points.per_pixel - 1).bit_length(), max(1, POOL_SIZE // k // 16))
         out = np.empty((2, len(points)), np.int64)
         for which in (0, 1):
             number = _hash(points.pixel + (points.sample // block) * 0x5851F42D, self.seed * 2 + which)
-            out[which] = (number // block) % (POOL // k // block) * block + ((points.sample % block) ^ (number % block))
+            out[which] = (number // block) % (POOL_SIZE // k // block) * block + (
+                (points.sample % block) ^ (number % block)
+            )
         return out
 
     def _accumulate(self, points: ShadingPoints, part: slice, runs: np.ndarray | None, sums: np.ndarray) -> _RayCounts:
-        """Compute the sums (SUMS, 3, n) of the n points that `part` selects, in place, and count their shadow rays.
+        """Compute the sums (SUM_ROWS, 3, n) of the n points that `part` selects, in place, and count their shadow rays.
 
         runs: the points' indices from _choose_runs(), or None for no samples.
         """
@@ -279,7 +281,7 @@ class DirectLight:
         )
 
     def _compose(self, points: ShadingPoints, sums: np.ndarray) -> np.ndarray:
-        """Compose radiance (3, n), without emission, from the points' sums (SUMS, 3, n)."""
+        """Compose radiance (3, n), without emission, from the points' sums (SUM_ROWS, 3, n)."""
         if not len(points):
             return np.empty((3, 0), np.float32)
         import torch
@@ -328,7 +330,7 @@ def _visible_share(visible: np.ndarray, everything: np.ndarray, known: np.ndarra
     """
     r, g, b = LUMINANCE.astype(np.float32)
     v, u, k = (np.add.reduceat(r * x[0] + g * x[1] + b * x[2], starts) for x in (visible, everything, known))
-    return np.clip((v + PRIOR * k) / np.maximum(u + PRIOR * k, np.float32(1e-20)), 0, 1)
+    return np.clip((v + VISIBLE_PRIOR * k) / np.maximum(u + VISIBLE_PRIOR * k, np.float32(1e-20)), 0, 1)
 
 
 def _hash(index: np.ndarray, seed: int) -> np.ndarray:
