@@ -23,7 +23,7 @@ PLACE_BLUR_PX = 1.5  # Gaussian blur of a part's depth
 MIN_HALF_PX, MAX_HALF_PX = 1.0, 3.0  # pixels: least and most half thickness of a part
 SEARCH_RANGE = 0.75  # world units to either side of the origin that are searched for a part
 DEPTHS_PER_PIXEL = 2  # candidate depths per pixel size
-MIN_FACING_COSINE = 0.2  # least cosine between a drawn normal and the direction to the camera
+MIN_FACING_COSINE = 0.2  # least cosine between a part's normal and the direction to the camera
 
 
 @dataclass(frozen=True)

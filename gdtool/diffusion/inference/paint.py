@@ -3,7 +3,7 @@
 The model reproduces the color of that view with all of its contrast, and the albedo with about half of it. Color
 divided by albedo is light, which on a surface under distant light is a smooth function of the normal. So the albedo is
 set to the color times a factor. Around each pixel the factor is the linear function of the normal that fits the model's
-own ratio of albedo to color best. That alone would turn highlights and shadows into paint. So the model's albedo
+ratio of albedo to color best. That alone would turn highlights and shadows into paint. So the model's albedo
 decides how far a detail of the color is paint: where the albedo lacks the detail, nothing is changed.
 """
 

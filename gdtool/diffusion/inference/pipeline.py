@@ -27,7 +27,7 @@ def sample_condition(
 ) -> dict[str, torch.Tensor]:
     """Sample all views from a framed picture (size, size, 4); returns encoded images (1, k, 3, h, w) by domain.
 
-    ranges_folder: model folder with the ranges of the training pictures; a picture outside them brings a warning.
+    ranges_folder: model folder with the ranges of the training pictures; a picture outside them causes a warning.
     compiled: whether to compile the network first. name: the picture's name in warnings.
     """
     rgba = condition_batch(condition)

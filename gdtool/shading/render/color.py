@@ -1,4 +1,4 @@
-"""Render the lit color of a scene from one camera, with a renderer and a light of its own."""
+"""Render the lit color of a scene from one camera: set up the renderer and the light, and render."""
 
 from __future__ import annotations
 

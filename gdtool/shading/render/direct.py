@@ -66,7 +66,7 @@ class _RayCounts(NamedTuple):
     """Count the shadow rays of a chunk of points: those cast, and those left out, for three reasons.
 
     below_horizon: the direction is below the horizon. convex: nothing can hide a point of a convex object. rare: the
-    direction brings little light.
+    direction contributes little light.
     """
 
     cast: int = 0

@@ -331,7 +331,7 @@ class _Film:
         self.samples, self.hits = np.zeros(pixels), np.zeros(pixels)
         self.sums: dict[str, np.ndarray] = {}
         self.squares: dict[str, np.ndarray] = {}
-        # Of the last call of update_psnr: means, samples, and each pixel's squared error.
+        # Set by update_psnr: means and samples at its last call, and each pixel's squared error.
         self.last_mean: np.ndarray | None = None
         self.last_samples: np.ndarray | None = None
         self.squared_change: np.ndarray | None = None
