@@ -35,7 +35,15 @@ from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, encode, list_files
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
-from gdtool.diffusion.inference.familiarity import DOUBTS, FILE, doubts, limits, read_ranges, unfamiliar, write_ranges
+from gdtool.diffusion.inference.familiarity import (
+    DOUBTS,
+    RANGES_FILE,
+    describe_doubts,
+    describe_unfamiliar,
+    read_ranges,
+    usual_ranges,
+    write_ranges,
+)
 from gdtool.diffusion.inference.result import views_from_images
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.encoding import BACKGROUND
@@ -87,7 +95,7 @@ def calibrate(model, path: Path, folders: list[Path]) -> None:
     """Write the limits that the share ALARMS of these objects passes to a model folder."""
     reports = [result_of(model, decode_object(folder, model.config)[1][0])[1] for folder in views_folders(folders)]
     folder = open_folder(path, ("model",))
-    write_ranges(path / FILE, read_ranges(path) | limits(reports, ALARMS))
+    write_ranges(path / RANGES_FILE, read_ranges(path) | usual_ranges(reports, ALARMS))
     (path / MANIFEST).unlink()
     (path / MANIFEST).write_bytes(encode(msgspec.structs.replace(folder.manifest, files=list_files(path))))
 
@@ -136,13 +144,15 @@ def tables(held: list[dict], real: list[dict], photographs: list[dict], known: d
         + " |",
         "|---" * (len(ERRORS) + 4) + "|",
     ]
-    warnings = {"the picture is unlike those in training": lambda one: unfamiliar(one["condition"], known)}
+    warnings = {"the picture is unlike those in training": lambda one: describe_unfamiliar(one["condition"], known)}
     warnings |= {
-        f"{name} above {known[name].high:.3g}": lambda one, name=name: doubts({name: one["report"][name]}, known)
+        f"{name} above {known[name].high:.3g}": lambda one, name=name: describe_doubts(
+            {name: one["report"][name]}, known
+        )
         for name in DOUBTS
         if name in known
     }
-    warnings["the model is unsure: any of these"] = lambda one: doubts(one["report"], known)
+    warnings["the model is unsure: any of these"] = lambda one: describe_doubts(one["report"], known)
     for name, says in warnings.items():
         told = np.array([bool(says(one)) for one in both])
         cells = [

@@ -26,7 +26,7 @@ import gdtool.bake.picture as picture
 from benchmarks.common.measure import machine, number, table
 from benchmarks.train.quality import DEFAULT_MODEL, sampled_views, views_folders
 from gdtool.diffusion.checkpoint.weights import load_model
-from gdtool.diffusion.data.objects import to_tensor_condition
+from gdtool.diffusion.data.objects import condition_batch
 from gdtool.folders.views import read_views
 from gdtool.images.color import srgb_from_linear
 from gdtool.images.metrics import over_white, psnr, resized, ssim
@@ -92,7 +92,7 @@ def main() -> None:
             straight(np.concatenate([small[..., part], small[..., 6:]], -1)) for part in (slice(0, 3), slice(3, 6))
         )
         made = sampled_views(
-            model, to_tensor_condition(np.concatenate([condition, small[..., 6:]], -1).astype(np.float32)), 0, steps=1
+            model, condition_batch(np.concatenate([condition, small[..., 6:]], -1).astype(np.float32)), 0, steps=1
         )
         front = made.names.index("front")
         rows = [

@@ -283,7 +283,7 @@ def install(source: Path, table: str, note: str) -> None:
     folder = open_folder(source, ("model",))
     if source.resolve() != DEFAULT_MODEL.resolve():
         DEFAULT_MODEL.mkdir(exist_ok=True)
-        for name in ("config.json", "model.safetensors", "loss.csv", "loss.png", "card.md", familiarity.FILE):
+        for name in ("config.json", "model.safetensors", "loss.csv", "loss.png", "card.md", familiarity.RANGES_FILE):
             shutil.copyfile(source / name, DEFAULT_MODEL / name)
     card = (DEFAULT_MODEL / "card.md").read_text().split("## Measured quality")[0].rstrip()
     (DEFAULT_MODEL / "card.md").write_text(f"{card}\n\n## Measured quality\n\n{note}\n\n{table}")

@@ -1,7 +1,7 @@
 """Configure the diffusion model and its training; the presets `paper`, `small` and `tiny` run the same code.
 
-ModelConfig holds everything that a model folder needs to be rebuilt (its config.json), TrainConfig everything that a
-run needs.
+ModelConfig is a model folder's config.json: what is needed to build the network again. TrainConfig is what a training
+run needs in addition.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.names import text_fault
 
-# Wonder3D's [elevation of the condition, view's elevation, view's azimuth] and our six labels, as sin and cos each.
+# Of a class label: sine and cosine of [elevation of the condition, view's elevation, view's azimuth, one-hot domain].
 CLASS_WIDTH = 2 * (3 + len(DOMAINS))
 
 
-# Bounds of what a configuration file may ask for: far above any model that was trained, low enough that a network's
-# structure is known in a second and its memory can be predicted before it is made.
+# Bounds of a configuration file's values: far above any model that was trained, and low enough that a network is built
+# on the meta device in a second, so that its memory is known before it is allocated.
 Pixels = Annotated[int, Meta(ge=1, le=4096)]
 Width = Annotated[int, Meta(ge=1, le=16384)]  # channels
 Layers = Annotated[int, Meta(ge=1, le=64)]
@@ -32,7 +32,7 @@ ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
 
 
 class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe the network, its inputs and its noise. Sizes in pixels unless said otherwise."""
+    """Describe the network, its inputs and its noise. Sizes are in pixels unless a comment says otherwise."""
 
     image_size: Pixels = 64
     views: Annotated[tuple[str, ...], Meta(min_length=1)] = (
@@ -48,12 +48,12 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     codec: Literal["vae", "patch"] = "patch"
     patch: Pixels = 4
     condition_alpha: bool = True  # the mask as fourth channel of the condition latent; patch codec only
-    mirror_back: bool = True  # the view from behind gets the mirrored condition latent: its silhouette is exactly that
+    mirror_back: bool = True  # the back view gets the mirrored condition latent, which has its silhouette
     # UNet, in Stable Diffusion's structure and key names.
     channels: Annotated[tuple[Width, ...], Meta(min_length=1, max_length=MAX_LEVELS)] = (48, 128, 128)
     attention_levels: tuple[bool, ...] = (False, True, True)
     layers_per_block: Layers = 1
-    heads: Annotated[int, Meta(ge=0, le=1024)] = 0  # heads per attention; 0: as many as give head_width
+    heads: Annotated[int, Meta(ge=0, le=1024)] = 0  # heads per attention; 0: width / head_width
     head_width: Width = 32
     norm_groups: Width = 16
     feed_forward: Annotated[int, Meta(ge=1, le=64)] = 2  # width of the gated feed-forward in units of the token's width
@@ -64,9 +64,9 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     # attention across the images of an object
     multi_view: bool = True
     row_attention: tuple[bool, ...] = ()  # levels with attention along the rows that the views share; (): none
-    # a star around color, or Wonder3D's attention over all domains of a view, in the middle or at the end of each block
+    # attention in a star around color, or Wonder3D's over all domains of a view, in the middle or at the end of a block
     cross_domain: Literal["none", "one_way", "two_way", "joint", "joint_last"] = "two_way"
-    # what tells an image its view and domain, and the cameras: ours, or Wonder3D's numbers verbatim
+    # class labels and cameras: gdtool's, or Wonder3D's published numbers
     convention: Literal["gdtool", "wonder3d"] = "gdtool"
     # image encoder: "clip" is one projected embedding as one token, "patch" a small transformer over the image's
     # patches
@@ -76,38 +76,38 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     encoder_patch: Pixels = 8
     # noise
     prediction: Literal["epsilon", "v", "x"] = "x"
-    # scale of the network's noisy input: "unit" is variance preserving; "shrunk" is the linear estimate of x_0 from it,
-    # so that pure noise, which says nothing, comes in as nothing (x-prediction only)
+    # the network's noisy input: "unit" has variance 1; "shrunk" is the linear estimate of x_0 from it, which is 0 for
+    # pure noise (x-prediction only)
     noisy_input: Literal["unit", "shrunk"] = "unit"
     timesteps: Annotated[int, Meta(ge=2, le=100_000)] = 1000
     noise_schedule: Literal["scaled_linear", "cosine"] = "cosine"
-    # Denoising steps of sample-views when none are asked for: what measured best for this model.
+    # default denoising steps of sample-views: the number that measured best for this model
     sampling_steps: Annotated[int, Meta(ge=1, le=1000)] = 50
-    # the mean of what is made of the picture and of its mirror image; twice the time. Patch codec and own convention
-    # only.
+    # average the predictions for the picture and for its mirror image, in twice the time; patch codec and convention
+    # "gdtool" only
     sampling_mirrored: bool = False
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: Annotated[tuple[Literal["white", "grey", "black"], ...], Meta(min_length=1)] = ("grey",)
-    # where the pretrained parts of the paper's configuration live: a local folder or a hub id
+    # source of the pretrained parts of the paper's configuration: a local folder or a hub id
     pretrained: str = ""
     revision: str = ""  # branch, tag or commit of a hub id; "": its main branch
 
     def __post_init__(self) -> None:
-        """Raise ValueError, which msgspec reports as its ValidationError, where the fields do not fit one another."""
+        """Raise ValueError where the fields do not fit one another; msgspec reports it as its ValidationError."""
         fault = _fault(self)
         if fault:
             raise ValueError(fault)
 
 
 def _fault(config: ModelConfig) -> str | None:
-    """Describe the first field of which no network can be made, and its bound; None where all fit."""
+    """Describe the first field from which no network can be built, and its bound. Returns None where all fields fit."""
     known = [name for name, _ in SIX_VIEWS]
     for field, values, names in (("views", config.views, known), ("domains", config.domains, DOMAINS)):
         unknown = [value for value in values if value not in names]
         if unknown:
             return f"{field} names {unknown[0]!r}, which is none of {', '.join(names)}"
         if len(set(values)) < len(values):
-            return f"{field} names one twice"
+            return f"{field} names a value twice"
     levels = len(config.channels)
     for field, values in (("attention_levels", config.attention_levels), ("row_attention", config.row_attention)):
         if len(values) != levels and (values or field == "attention_levels"):
@@ -146,8 +146,10 @@ def _fault(config: ModelConfig) -> str | None:
 
 
 class Phase(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Describe a part of the training: until `share` of the run is over, each step sees `domains` and `views` of an
-    object.
+    """Describe a part of the training.
+
+    The phase lasts until `share` of the run is over, 0 to 1. Each of its steps trains on `domains` of the domains and
+    `views` of the views of an object.
     """
 
     share: Share = 1.0
@@ -166,7 +168,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 8
     accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
     steps: Annotated[int, Meta(ge=1, le=10**9)] = 4000
-    # The last phase sees all images at once, as sampling does; few objects then, so that a step costs about the same.
+    # The last phase has all images at once, as sampling does, and few objects, so that a step costs about the same.
     phases: Annotated[tuple[Phase, ...], Meta(min_length=1, max_length=100)] = (
         Phase(share=0.6, domains=3, views=3),
         Phase(share=0.8, domains=6, views=3, batch=4),
@@ -182,13 +184,13 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     ema: Share = 0.999
     snr_gamma: Weight = 5.0  # min-SNR: a clean image's error is weighted by min(SNR, gamma) …
     snr_floor: Weight = 1.0  # … and at least by this, or a model that samples in few steps never learns the first one
-    # of each domain's values in the error, in the order of DOMAINS; the coverage beside the scalars' always weighs 1.
+    # weights of each domain's values in the error, in the order of DOMAINS; coverage always has weight 1.
     # Depth's spread inside an object is a tenth of the others', so at 1 it is not learned. Patch codec only.
     domain_weights: tuple[Weight, Weight, Weight, Weight, Weight, Weight] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
-    # whose values are compared by distance instead of its square: one step of sampling then gives their median, which
-    # is sharper than their mean and nearer on average. Patch codec only.
+    # domains whose values are compared by distance instead of its square. One step of sampling then gives their median,
+    # which is sharper than their mean and nearer on average. Patch codec only.
     absolute_domains: tuple[Literal[DOMAINS], ...] = ()
-    pure_noise: Share = 0.6  # share of samples at the last timestep
+    pure_noise: Share = 0.6  # share of objects at the last timestep
     drop_embedding: Share = 0.05
     drop_both: Share = 0.05
     drop_latent: Share = 0.05
@@ -197,8 +199,8 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     mirror: bool = True
     hue: bool = True
     pbr_weight: Weight = 0.1
-    pbr_snr: Weight = 1.0  # supervision by rendering acts only where the SNR is above this
-    pbr_pixels: Annotated[int, Meta(ge=1, le=10**9)] = 768  # per object
+    pbr_snr: Weight = 1.0  # the rendering loss applies where the SNR is above this
+    pbr_pixels: Annotated[int, Meta(ge=1, le=10**9)] = 768  # shaded for each object by the rendering loss
     precision: Literal["float32", "bfloat16"] = "bfloat16"
 
 
@@ -227,8 +229,8 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
             phases=(Phase(share=0.5, domains=2, views=2), Phase(share=1.0)),
         ),
     ),
-    # what a laptop trains over lunch, and what the bundled model is. While it is trained for minutes and not for days,
-    # its first prediction is its best (docs/benchmarks/model_quality.md).
+    # small enough to train on a laptop; the bundled model has it. After minutes of training instead of days, one
+    # denoising step is better than several (docs/benchmarks/model_quality.md).
     "small": (
         ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"),
         TrainConfig(),
@@ -279,12 +281,12 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     ),
 }
 
-# What the paper's claims are measured against: each a change of the configuration, nothing else.
+# Variants that the paper's claims are compared with, as changes of the model's and the training's configuration.
 ABLATIONS: dict[str, tuple[dict, dict]] = {
     "none": ({}, {}),
-    "no_cross_domain": ({"cross_domain": "none"}, {}),  # each domain is sampled as if it were alone
-    "one_way": ({"cross_domain": "one_way"}, {}),  # color reads the other domains, they never hear of color
+    "no_cross_domain": ({"cross_domain": "none"}, {}),  # each domain is sampled without the others
+    "one_way": ({"cross_domain": "one_way"}, {}),  # color attends to the other domains, not they to color
     "two_way": ({"cross_domain": "two_way"}, {}),
-    "no_pbr": ({}, {"pbr_weight": 0.0}),  # no supervision by rendering
-    "color_normal": ({"domains": ("color", "normal")}, {"pbr_weight": 0.0}),  # Wonder3D's set; nothing to render from
+    "no_pbr": ({}, {"pbr_weight": 0.0}),  # no rendering loss
+    "color_normal": ({"domains": ("color", "normal")}, {"pbr_weight": 0.0}),  # Wonder3D's domains, too few to render
 }

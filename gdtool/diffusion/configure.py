@@ -16,9 +16,17 @@ from gdtool.diffusion.config import ABLATIONS, PRESETS, ModelConfig, TrainConfig
 def configuration(
     preset: str, ablation: str, file: str | None, values: Mapping[str, int], size: int | None
 ) -> tuple[ModelConfig, TrainConfig]:
-    """Return the preset with the changes of the ablation, then of the file, then of values, resized.
+    """Build the configurations of a preset, changed by an ablation, then by a file, then by values.
 
-    file: path of JSON {"model": {...}, "train": {...}}. values: of TrainConfig. Raises InputError for a bad file.
+    Args:
+        preset: a name in PRESETS.
+        ablation: a name in ABLATIONS.
+        file: path of JSON {"model": {...}, "train": {...}} with fields of ModelConfig and TrainConfig, or None.
+        values: fields of TrainConfig.
+        size: image size in pixels that the model is resized to at last, or None.
+
+    Returns:
+        The model's and the training's configuration. Raises InputError for a file or a size that does not fit.
     """
     parts = [msgspec.to_builtins(part) for part in PRESETS[preset]]
     for part, changes in zip(parts, ABLATIONS[ablation], strict=True):
@@ -39,7 +47,7 @@ def configuration(
     except msgspec.ValidationError as error:
         raise InputError(file or "configuration", str(error), "correct that value in the file of --config") from None
     if size is not None:
-        from gdtool.diffusion.network.grow import resized
+        from gdtool.diffusion.network.grow import resize_config
 
-        model = resized(model, size)
+        model = resize_config(model, size)
     return model, train

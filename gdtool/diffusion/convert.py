@@ -1,7 +1,7 @@
 """Convert pickled weights to safetensors: python -m gdtool.diffusion.convert FILE_OR_FOLDER …
 
-A pickle can run code. Only tensors are rebuilt here (torch.load with weights_only), in a child process with limits on
-time and memory. Its one result is the safetensors file, written beside the pickle, which stays.
+A pickle can run code. So torch.load reads tensors alone (weights_only), in a child process with limits on time and
+memory. The child writes one safetensors file beside the pickle. The pickle stays.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ NAMES = {"pytorch_model.bin": "model.safetensors"}  # transformers names the two
 
 
 def convert(source: str, target: str) -> int:
-    """Write the tensors of a pickle as safetensors and return their number. Runs in the child."""
+    """Write the tensors of a pickle as safetensors and return their number. Runs in the child process."""
     import torch
     from safetensors.torch import save_file
 
     tensors = torch.load(source, map_location="cpu", weights_only=True)
     tensors = tensors.get("state_dict", tensors)
-    kept = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
-    if not kept:
+    weights = {name: x.detach().clone().contiguous() for name, x in tensors.items() if isinstance(x, torch.Tensor)}
+    if not weights:
         raise ValueError("holds no tensors")
     partial = partial_of(target)
-    save_file(kept, partial, metadata={"format": "pt"})
+    save_file(weights, partial, metadata={"format": "pt"})
     partial.chmod(0o644)
     partial.replace(target)
-    return len(kept)
+    return len(weights)
 
 
 def partial_of(target: str | Path) -> Path:
-    """Return the path that the child writes to until the file is complete."""
+    """Return the path that the child process writes to until the file is complete."""
     return Path(f"{target}.partial")
 
 

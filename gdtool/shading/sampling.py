@@ -1,6 +1,8 @@
-"""Make evenly spread points and directions, and tangent bases around normals."""
+"""Make evenly spread points and directions, and orthonormal bases around normals."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
@@ -8,7 +10,7 @@ import numpy as np
 def sobol(count: int, dimensions: int, seed: int) -> np.ndarray:
     """Draw (count, dimensions) scrambled Sobol points in [0, 1).
 
-    With a count that is a power of two, every aligned run of 2^k points is stratified as well.
+    Where count is a power of two, every run of 2^k points that starts at a multiple of 2^k is stratified as well.
     """
     import torch
 
@@ -32,7 +34,7 @@ def orthonormal_basis(x, y, z):
     "Building an Orthonormal Basis, Revisited").
     """
     if isinstance(z, np.ndarray):
-        sign = np.where(z < 0, -1, 1).astype(z.dtype)
+        sign: Any = np.where(z < 0, -1, 1).astype(z.dtype)
     else:
         import torch
 

@@ -22,7 +22,7 @@ from gdtool.core.stage import FILE, Inputs, Output, SecondInput, Stage
 from gdtool.stages.shared_options import Brdf, Exposure, Fov, Seed
 
 if TYPE_CHECKING:
-    from gdtool.shading.render.dataset import Lamps
+    from gdtool.shading.render.dataset import PreparedLight
     from gdtool.shading.render.render import Renderer
 
 ALL = (*DOMAINS, "closed_form")  # every image that a view can have
@@ -124,11 +124,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     else:
         cameras = cameras_by_rig(options.rig, options.views, options.size, options.elevation, options.fov)
     renderer = Renderer(scene, out.threads)
-    lamps: Lamps | None = None
+    lamps: PreparedLight | None = None
     if options.condition_views or not {"color", "closed_form"}.isdisjoint(options.domains):
         with out.step("light"):
             light = dataset.light_name(options.light or "random", inputs.name, options.seed, views)
-            lamps = dataset.prepare_lamps(renderer, light, options.light_samples, options.seed, options.brdf)
+            lamps = dataset.prepare_light(renderer, light, options.light_samples, options.seed, options.brdf)
     with out.step("render"):
         how = dataset.ViewOptions(options.samples, options.domains, options.exposure)
         images, mask = dataset.render_views(renderer, cameras, lamps, how, out.progress)
@@ -164,7 +164,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     _tell_skips(out, renderer, options, lamps)
 
 
-def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: Lamps | None) -> None:
+def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: PreparedLight | None) -> None:
     """Record what the scene and the options did not need."""
     from gdtool.shading.render.skipped_work import skipped_work
 

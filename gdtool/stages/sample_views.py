@@ -96,9 +96,9 @@ def check(inputs: Inputs, options: Options) -> None:
             early.require_picture("the source", str(inputs.main)),
         )
         if sorted(mask) != sorted(image):  # a camera held upright swaps the two
-            from gdtool.diffusion.data.condition import wrong_size
+            from gdtool.diffusion.data.condition import mask_size_error
 
-            raise wrong_size(options.mask, mask, image)
+            raise mask_size_error(options.mask, mask, image)
     if options.matting is not None:
         early.require_file("--matting", options.matting)
         early.require_package("onnxruntime", "--matting", "pip install 'gdtool[matting]', or give a mask with --mask")
@@ -111,8 +111,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.cameras import rig
     from gdtool.diffusion.checkpoint import wonder3d
     from gdtool.diffusion.checkpoint.weights import load_model
-    from gdtool.diffusion.data.condition import PictureOptions, condition_of, extent_of
-    from gdtool.diffusion.inference.pipeline import choose_domains, sample_condition, tell_doubts
+    from gdtool.diffusion.data.condition import PictureOptions, make_condition, trained_extent
+    from gdtool.diffusion.inference.pipeline import choose_domains, sample_condition, warn_of_doubts
     from gdtool.diffusion.inference.result import views_from_images
     from gdtool.diffusion.inference.sampling import SamplingOptions
     from gdtool.diffusion.network.encoding import BACKGROUND
@@ -125,9 +125,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     config = model.config
     domains = choose_domains(None if options.domains == DOMAINS else options.domains, config)
     with out.step("condition"):
-        extent = extent_of(config.convention)
+        extent = trained_extent(config.convention)
         framing = PictureOptions(options.mask, options.matting, options.crop, extent, config.image_size)
-        condition, picture = condition_of(inputs.path, inputs.name, framing, out.warn)
+        condition, picture = make_condition(inputs.path, inputs.name, framing, out.warn)
     with out.step("sample"):
         settings = SamplingOptions(
             domains=domains,
@@ -152,7 +152,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         domains,
         condition[..., 3],
     )
-    tell_doubts(folder, report, config, settings, inputs.name, out)
+    warn_of_doubts(folder, report, config, settings, inputs.name, out)
     with out.step("write"):
         _write(views, report, condition, picture, domains, out)
 
@@ -166,16 +166,16 @@ def _write(
     out: Output,
 ) -> None:
     """Write the views folder, the condition image that the model saw, and the framed picture."""
-    from gdtool.diffusion.data.condition import encoded_rgba
+    from gdtool.diffusion.data.condition import encode_rgba
     from gdtool.diffusion.inference.pipeline import tell_unused_picture
     from gdtool.folders.views import write_views
     from gdtool.images.io import write_png
 
-    write_png(out.path("condition/000.png"), encoded_rgba(condition))
+    write_png(out.path("condition/000.png"), encode_rgba(condition))
     own_view = "front" if "front" in views.names else ""  # the view that the picture was taken from
     tell_unused_picture(report, domains, bool(own_view), out)
     if own_view:
-        write_png(out.path("picture.png"), encoded_rgba(picture))
+        write_png(out.path("picture.png"), encode_rgba(picture))
     write_views(out, views, conditions=1, picture=own_view, report=report)
 
 

@@ -157,10 +157,10 @@ def dismiss() -> None:
 
 def plan(options: Options, as_json: bool) -> str:
     """Predict what the training would cost, as text or as one JSON object."""
-    from gdtool.diffusion.reports.plan import plan_of, text_of
+    from gdtool.diffusion.reports.plan import format_plan, make_plan
 
-    report = plan_of(*configured(options))
-    return msgspec.json.encode(report).decode() if as_json else text_of(report)
+    report = make_plan(*configured(options))
+    return msgspec.json.encode(report).decode() if as_json else format_plan(report)
 
 
 def configured(options: Options):

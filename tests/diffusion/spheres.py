@@ -1,4 +1,4 @@
-"""Analytic training data: one painted sphere per seed, seen by the default rig."""
+"""Make analytic training data: a painted sphere for each seed, in the default rig's views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ LIGHT = {
 def sphere_views(
     seed: int, size: int = 32, domains=("color", "normal", "depth", "albedo", "roughness", "metallic")
 ) -> Views:
-    """A sphere of radius 0.5 at the origin: red where x > 0, green elsewhere, darkened by the seed; depth is exact."""
+    """Render a sphere of radius 0.5 at the origin analytically, with exact depth.
+
+    It is red where x > 0 and green elsewhere. The seed sets its brightness, roughness and metallic.
+    """
     cameras = rig("six", size)
     rng = np.random.default_rng(seed)
     tint, roughness, metallic = 0.3 + 0.7 * rng.random(), rng.random(), float(rng.random() < 0.5)

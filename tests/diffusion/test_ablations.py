@@ -1,4 +1,4 @@
-"""The ablations as configurations: what each changes, and which image reads which."""
+"""Check what each ablation changes in the configuration, and which image attends to which."""
 
 import msgspec
 import pytest
@@ -20,13 +20,13 @@ def model_of(name):
     config, train = configured(Options(preset="tiny", ablation=name))
     torch.manual_seed(0)
     model = Model(msgspec.structs.replace(config, **SMALL)).eval()
-    for p in model.parameters():  # nothing at zero, so that every path shows
+    for p in model.parameters():  # no weight at zero, so that every path has an effect
         if p.ndim >= 2 and not p.any():
             torch.nn.init.normal_(p, std=0.2)
     return model, train
 
 
-# who reads whom across domains, plainly: (reader, read)
+# (reader, read): which domain attends to which
 READS = {
     "none": {(COLOR, NORMAL), (COLOR, ROUGHNESS), (NORMAL, COLOR), (ROUGHNESS, COLOR)},
     "two_way": {(COLOR, NORMAL), (COLOR, ROUGHNESS), (NORMAL, COLOR), (ROUGHNESS, COLOR)},
@@ -38,14 +38,16 @@ READS = {
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_which_image_reads_which(name):
-    """Through one transformer block: a change in one image moves exactly the images that attend to it. All views of a
-    domain read one another; across domains only the same view is read, and only along the star."""
+def test_an_image_changes_exactly_those_that_attend_to_it(name):
+    """Change one image before a transformer block: exactly the images that attend to it change after the block.
+
+    Across domains an image attends to the same view only, and only along the star around color.
+    """
     model, _ = model_of(name)
     domains = (COLOR, NORMAL) if name == "color_normal" else (COLOR, NORMAL, ROUGHNESS)
     layout = Layout(1, domains, 2)
     block = next(m for m in model.modules() if type(m).__name__ == "TransformerBlock")
-    block.attn1.to_out[0].weight.data.zero_()  # views do not meet here: that is the other test
+    block.attn1.to_out[0].weight.data.zero_()  # no attention across views here
     block.attn1.to_out[0].bias.data.zero_()
     x = torch.randn(layout.images, 4, 16)
     context = torch.randn(1, 3, 16)
@@ -60,7 +62,7 @@ def test_which_image_reads_which(name):
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
-def test_each_samples_its_domains(name):
+def test_each_ablation_samples_its_domains(name):
     model, train = model_of(name)
     images = sample_images(model, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1))
     assert tuple(images) == (("color", "normal") if name == "color_normal" else DOMAINS)

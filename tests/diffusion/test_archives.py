@@ -1,4 +1,4 @@
-"""Training data in tar files, plain and in WebDataset's naming."""
+"""Check training data in tar files, with plain names and in WebDataset's naming."""
 
 import tarfile
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.data.archives import object_count, placed, views_of
+from gdtool.diffusion.data.archives import object_count, split_member_name, unpack_views
 from gdtool.folders.views import read_views
 from tests.stages.dataset import write_spheres
 
@@ -32,7 +32,7 @@ def test_an_archive_gives_the_folders_it_was_made_of(tmp_path, webdataset):
     (tmp_path / "work").mkdir()
     assert object_count(tmp_path / "a.tar") == 3
     for folder, original in zip(
-        views_of(tmp_path / "a.tar", tmp_path / "work"), sorted(spheres.glob("*.asset/views")), strict=True
+        unpack_views(tmp_path / "a.tar", tmp_path / "work"), sorted(spheres.glob("*.asset/views")), strict=True
     ):
         from gdtool.core.folder import open_folder
 
@@ -56,14 +56,14 @@ def test_training_on_an_archive_is_training_on_its_folders(gdtool, tmp_path):
     assert (tmp_path / "x/model.safetensors").read_bytes() == (tmp_path / "y/model.safetensors").read_bytes()
 
 
-def test_names_of_both_kinds():
-    assert placed("a.asset/views/manifest.json") == ("a.asset/views", "manifest.json")
-    assert placed("a.asset/views/color/front.png") == ("a.asset/views", "color/front.png")
-    assert placed("d/000.color.front.png") == ("d/000", "color/front.png")
-    assert placed("d/000.manifest.json") == ("d/000", "manifest.json")
+def test_member_names_of_both_kinds_are_split():
+    assert split_member_name("a.asset/views/manifest.json") == ("a.asset/views", "manifest.json")
+    assert split_member_name("a.asset/views/color/front.png") == ("a.asset/views", "color/front.png")
+    assert split_member_name("d/000.color.front.png") == ("d/000", "color/front.png")
+    assert split_member_name("d/000.manifest.json") == ("d/000", "manifest.json")
 
 
-def test_what_is_no_archive_is_named(tmp_path):
+def test_a_file_that_is_no_archive_is_refused(tmp_path):
     (tmp_path / "x.tar").write_bytes(b"no tar at all" * 100)
     with pytest.raises(InputError, match="not a whole tar"):
         object_count(tmp_path / "x.tar")

@@ -1,4 +1,4 @@
-"""Facts about attention across views and domains."""
+"""Check attention across views and domains against its formula."""
 
 import pytest
 import torch
@@ -29,7 +29,7 @@ def test_attention_is_softmax_of_scaled_products():
     torch.testing.assert_close(attention(x)[0], attention.to_out[0](torch.cat(heads, 1)))
 
 
-def test_cross_domain_attention_starts_as_nothing():
+def test_cross_domain_attention_starts_without_effect():
     layout = Layout(1, (0, 1, 2), 2)
     x = tokens(layout)
     with_star, without = block("two_way"), block("none")
@@ -46,26 +46,26 @@ def trained_star(two_way):
 
 
 def test_star_formula_for_color():
-    """Color's answer is the one-layer fusion of what its queries find in each other domain of the same view."""
+    """Color's residual is one linear layer over what its queries read from each other domain of the same view."""
     star, layout = trained_star(False), Layout(1, (0, 2, 4), 2)
     x = tokens(layout).view(3, 2, 4, 16)
-    found = []
+    read = []
     for domain in range(1, 6):
         place = {2: 1, 4: 2}.get(domain)
         if place is None:
-            found.append(torch.zeros(2, 4, 16, dtype=torch.float64))
+            read.append(torch.zeros(2, 4, 16, dtype=torch.float64))
             continue
         q, k, v = star.to_q(x[0]), star.to_k(x[place]), star.to_v(x[place])
         heads = [
             torch.softmax(q[..., p] @ k[..., p].transpose(-1, -2) / 8**0.5, -1) @ v[..., p]
             for p in (slice(0, 8), slice(8, 16))
         ]
-        found.append(torch.cat(heads, -1))
-    expected = star.to_out[0](star.fuse(torch.cat(found, -1)))
+        read.append(torch.cat(heads, -1))
+    expected = star.to_out[0](star.fuse(torch.cat(read, -1)))
     torch.testing.assert_close(star(x.flatten(0, 1), layout).view(3, 2, 4, 16)[0], expected)
 
 
-def test_one_way_tells_the_others_nothing_and_two_way_does():
+def test_color_reaches_the_other_domains_in_the_two_way_star_only():
     layout = Layout(1, (0, 1, 5), 2)
     x = tokens(layout)
     changed = x.clone()
@@ -94,7 +94,7 @@ def test_star_without_partners_is_zero(domains):
     assert (trained_star(True)(tokens(layout), layout) == 0).all()
 
 
-def test_multi_view_attention_reads_all_views_of_its_own_domain_only():
+def test_multi_view_attention_reads_all_views_of_one_domain():
     layout = Layout(1, (0, 1), 3)
     x, context = tokens(layout), torch.zeros(1, 3, 8, dtype=torch.float64)
     changed = x.clone()
@@ -107,8 +107,8 @@ def test_multi_view_attention_reads_all_views_of_its_own_domain_only():
         assert (moved[1] == 0).all()
 
 
-def test_views_can_be_permuted():
-    """Attention has no order of its own: permuted views give permuted results."""
+def test_permuted_views_give_permuted_features():
+    """Attention does not depend on the order of the views."""
     layout, context = Layout(1, (0, 1), 3), torch.randn(1, 3, 8, dtype=torch.float64)
     network = block()
     torch.nn.init.normal_(network.attn_cross_domain.to_out[0].weight)
@@ -118,7 +118,7 @@ def test_views_can_be_permuted():
     torch.testing.assert_close(network(x[:, order].flatten(0, 1), context, layout).view(2, 3, 4, 16), direct)
 
 
-def test_row_attention_starts_as_nothing_and_reads_the_same_row_of_its_domains_views():
+def test_row_attention_starts_as_the_identity_and_reads_one_row_of_all_views():
     torch.manual_seed(0)
     layout, network = Layout(1, (0, 1), 3), RowAttention(16, 2, 4, 4).double()
     x = torch.randn(layout.images, 16, 5, 4, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""The codecs: what the VAE is asked for, in pieces of bounded size, and on which device."""
+"""Check the VAE codec: the size of its chunks, its gradient and its device; and what is decoded for rendering."""
 
 from types import SimpleNamespace
 
@@ -8,31 +8,34 @@ import pytest
 import torch
 
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.data.objects import draw
+from gdtool.diffusion.data.objects import draw_batch
 from gdtool.diffusion.network import codec as codecs
 from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.training.loop import choose, losses, phase_at
+from gdtool.diffusion.training.loop import choose_step, losses, phase_at
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 
 class StandInVae(torch.nn.Module):
-    """diffusers' interface: means of 8 x 8 pixels, and back. Writes down how many images it was given."""
+    """Stand in for diffusers' AutoencoderKL: encode to means of 8 x 8 pixels, and decode by repetition.
+
+    batches: the number of images of each call.
+    """
 
     config = SimpleNamespace(scaling_factor=0.5)
 
     def __init__(self):
         super().__init__()
         self.weight = torch.nn.Parameter(torch.ones(1))
-        self.given = []
+        self.batches = []
 
     def encode(self, images):
-        self.given.append(len(images))
+        self.batches.append(len(images))
         latent = torch.nn.functional.avg_pool2d(torch.cat([images, images[:, :1]], 1), 8) * self.weight
         return SimpleNamespace(latent_dist=SimpleNamespace(mode=lambda: latent))
 
     def decode(self, latents):
-        self.given.append(len(latents))
+        self.batches.append(len(latents))
         return SimpleNamespace(
             sample=torch.tanh(torch.nn.functional.interpolate(latents[:, :3], scale_factor=8) * self.weight)
         )
@@ -43,12 +46,12 @@ def vae_codec():
     return VaeCodec(msgspec.structs.replace(PRESETS["tiny"][0], codec="vae"), vae), vae
 
 
-def test_the_vae_is_given_few_images_at_a_time_and_the_result_is_that_of_all():
+def test_the_vae_runs_in_chunks_with_the_result_of_one_call():
     codec, vae = vae_codec()
     images = torch.rand(2 * CHUNK + 1, 3, 16, 16)
     latents = codec.encode(images)
-    assert vae.given == [CHUNK, CHUNK, 1]
-    torch.testing.assert_close(latents, torch.cat([codec.encode(one[None]) for one in images]))
+    assert vae.batches == [CHUNK, CHUNK, 1]
+    torch.testing.assert_close(latents, torch.cat([codec.encode(image[None]) for image in images]))
     torch.testing.assert_close(codec.decode(latents), vae.decode(latents / 0.5).sample)
 
 
@@ -56,18 +59,18 @@ def test_a_gradient_through_decode_is_exact_and_takes_the_activations_of_one_chu
     codec, vae = vae_codec()
     start = torch.randn(2 * CHUNK, 4, 2, 2)
     saved = []
-    given = []
+    held = []
     for decode in (codec.decode, lambda x: vae.decode(x / 0.5).sample):
         latents = start.clone().requires_grad_()
         with torch.autograd.graph.saved_tensors_hooks(lambda x: saved.append(x.numel()) or x, lambda x: x):
             out = decode(latents)
-        given.append(sum(saved))
+        held.append(sum(saved))
         saved.clear()
         out.square().sum().backward()
         if decode == codec.decode:
             expected = latents.grad
     torch.testing.assert_close(latents.grad, expected)
-    assert given[0] < given[1] / 4
+    assert held[0] < held[1] / 4
 
 
 def test_the_vae_follows_its_input(monkeypatch):
@@ -80,23 +83,23 @@ def test_the_vae_follows_its_input(monkeypatch):
 
 
 @pytest.mark.parametrize("near", [0, 1, 2])
-def test_only_what_the_rendering_loss_looks_at_is_decoded(monkeypatch, near):
-    """The four domains that light is computed from, of the objects with little noise."""
+def test_only_the_domains_and_objects_of_the_rendering_loss_are_decoded(monkeypatch, near):
+    """These are the four domains that shading reads, of the objects with little noise."""
     counts, plain = [], PatchCodec.decode
     monkeypatch.setattr(codecs.PatchCodec, "decode", lambda self, x: counts.append(len(x)) or plain(self, x))
     model, objects = Model(MODEL), spheres(2)
     train = msgspec.structs.replace(TRAIN, pure_noise=0.0)
-    step = choose(MODEL, phase_at(1.0, train), 0, 0)
+    step = choose_step(MODEL, phase_at(1.0, train), 0, 0)
     model.alpha = torch.full_like(model.alpha, 1e-3)
     model.sigma = torch.ones_like(model.sigma)
     choices, generators = zip(*(step.choices(place) for place in range(2)), strict=True)
     model.alpha[_timesteps(step)[:near]] = 3.0
-    losses(model, draw(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
+    losses(model, draw_batch(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
     assert sum(counts) == near * 4 * len(step.views)
 
 
 def _timesteps(step):
-    """The timesteps that losses() draws for two objects."""
+    """Return the timesteps that losses() chooses for two objects."""
     choices = [step.choices(place) for place in range(2)]
-    draw(spheres(2), np.arange(2), MODEL, TRAIN, [one[0] for one in choices])
+    draw_batch(spheres(2), np.arange(2), MODEL, TRAIN, [numpy_generator for numpy_generator, _ in choices])
     return [int(torch.rand(4, generator=generator)[0] * MODEL.timesteps) for _, generator in choices]

@@ -1,4 +1,4 @@
-"""Two processes by torchrun are one process: the loss curve, the weights, a kill."""
+"""Check that two processes started by torchrun train as one does: loss curve, weights, and resuming after a kill."""
 
 import csv
 import os
@@ -92,14 +92,14 @@ def single(tmp_path_factory):
     [(1, 2, False), (2, 1, False), pytest.param(2, 2, True, marks=pytest.mark.slow)],
     ids=["accumulated", "ddp", "fsdp"],
 )
-def test_the_curve_is_that_of_one_process(single, tmp_path, processes, accumulate, shard):
-    """Same global batch of four: in two parts one after the other, in two processes, and with the weights split too."""
+def test_the_loss_curve_equals_that_of_one_process(single, tmp_path, processes, accumulate, shard):
+    """Train with a global batch of four in two parts, in two processes, and with the weights split over processes."""
     curve, tensors = run(tmp_path, "many", processes, accumulate, shard)
-    one, many = (
+    expected, many = (
         np.genfromtxt(path, delimiter=",", skip_header=1) for path in (single[2], tmp_path / "many" / "validation.csv")
     )
     assert many[:, 0].tolist() == [3, 6]
-    np.testing.assert_allclose(many, one, atol=0.05)
+    np.testing.assert_allclose(many, expected, atol=0.05)
     assert len(curve) == 6
     np.testing.assert_allclose(curve, single[0], rtol=2e-4, atol=1e-6)
     assert tensors.keys() == single[1].keys()

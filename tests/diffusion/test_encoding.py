@@ -1,4 +1,4 @@
-"""What goes into the network comes out of it."""
+"""Check that domain images survive encoding and decoding, and how sampled images become views."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, whole_frame
-from gdtool.diffusion.network.encoding import coverage, decode, encode, mirrored, planes_from_images
+from gdtool.diffusion.network.encoding import coverage, decode, encode, mirror_images, planes_from_images
 from tests.diffusion.spheres import sphere_views
 
 
@@ -91,8 +91,8 @@ def test_whole_frame_pads_to_a_square():
     assert out[12:28, :, 3].min() > 0.99
 
 
-def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(sphere):
-    """Whatever the network guessed: here a sphere everywhere, and a picture that shows a slanted shape."""
+def test_front_and_back_silhouettes_are_the_pictures(sphere):
+    """The sampled images show a sphere, the picture a slanted shape: front and back get the picture's silhouette."""
     from gdtool.cameras import rig
     from gdtool.diffusion.inference.result import views_from_images
 
@@ -116,22 +116,22 @@ def test_the_pictures_silhouette_is_the_front_views_and_mirrored_the_backs(spher
 
 def test_mirrored_images_are_the_images_of_the_mirrored_object():
     from gdtool.cameras import rig
-    from gdtool.diffusion.data.objects import mirror
+    from gdtool.diffusion.data.objects import mirror_object
 
     generator, names = torch.Generator().manual_seed(0), tuple(camera.name for camera in rig("six", 8))
     planes = 2 * torch.rand(6, 13, 8, 8, generator=generator) - 1
-    turned = mirror(planes, torch.zeros(4, 8, 8), torch.zeros(16, 7), names)[0]
+    mirrored_planes = mirror_object(planes, torch.zeros(4, 8, 8), torch.zeros(16, 7), names)[0]
     for domains in (tuple(range(6)), (0, 1), (2, 3)):
-        one, other = (encode(x[None], domains, torch.tensor([1.0])) for x in (planes, turned))
-        torch.testing.assert_close(mirrored(one, domains, names), other)
-        torch.testing.assert_close(mirrored(other, domains, names), one)
+        images, images_of_mirrored = (encode(x[None], domains, torch.tensor([1.0])) for x in (planes, mirrored_planes))
+        torch.testing.assert_close(mirror_images(images, domains, names), images_of_mirrored)
+        torch.testing.assert_close(mirror_images(images_of_mirrored, domains, names), images)
 
 
-def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
-    from gdtool.diffusion.inference.result import decided
+def test_metallic_is_pushed_to_its_ends_and_edges_stay_soft():
+    from gdtool.diffusion.inference.result import sharpen_metallic
 
-    given = torch.linspace(0, 1, 101, dtype=torch.float64)
-    out = decided(given)
+    metallic = torch.linspace(0, 1, 101, dtype=torch.float64)
+    out = sharpen_metallic(metallic)
     assert out[0] == 0
     assert out[50] == 0.5
     assert out[100] == 1
@@ -142,9 +142,9 @@ def test_what_is_nearly_metal_is_metal_and_edges_stay_soft():
     assert out[40] > 0.1
 
 
-def test_only_metallic_is_decided(sphere):
+def test_only_metallic_is_sharpened(sphere):
     from gdtool.cameras import rig
-    from gdtool.diffusion.inference.result import decided, views_from_images
+    from gdtool.diffusion.inference.result import sharpen_metallic, views_from_images
 
     views, _ = sphere
     grey = np.full(views.mask.shape, 0.3, np.float32)
@@ -153,32 +153,35 @@ def test_only_metallic_is_decided(sphere):
     out, _ = views_from_images({d: encoded[i] for i, d in enumerate(DOMAINS)}, rig("six", 32), 0.0, DOMAINS)
     inside = out.mask > 0.99
     np.testing.assert_allclose(out.images["roughness"][inside], 0.3, atol=1e-3)
-    np.testing.assert_allclose(out.images["metallic"][inside], float(decided(torch.tensor(0.3))), atol=1e-3)
+    np.testing.assert_allclose(out.images["metallic"][inside], float(sharpen_metallic(torch.tensor(0.3))), atol=1e-3)
 
 
 def test_views_from_opposite_sides_get_one_outline():
-    """A model that guesses the outline from the right larger than from the left: both get the mean."""
+    """Two opposite views with different outlines both get the mean of the two."""
     from gdtool.cameras import rig
-    from gdtool.diffusion.inference.result import tied
+    from gdtool.diffusion.inference.result import average_opposite_views
 
     cameras = rig("six", 8)
     names, soft = [camera.name for camera in cameras], torch.rand(6, 8, 8, generator=torch.Generator().manual_seed(1))
-    out = tied(soft, cameras)
+    out = average_opposite_views(soft, cameras)
     right, left, slanted = (names.index(name) for name in ("right", "left", "front_right"))
     torch.testing.assert_close(out[right], (soft[right] + soft[left].flip(-1)) / 2)
     torch.testing.assert_close(out[left], out[right].flip(-1))
     torch.testing.assert_close(out[slanted], soft[slanted])
 
 
-def test_depth_stays_within_the_outlines_that_other_views_show():
-    """Of a ball whose right side the model draws too far out and whose front too far in; what is right stays."""
+def test_depth_stays_within_the_outlines_of_other_views():
+    """Displace a ball's depth, too far out in the right view and too far in in the front view.
+
+    Both are moved back within the ball's outlines, and correct depth stays.
+    """
     from gdtool.cameras import backproject
-    from gdtool.diffusion.inference.result import within_silhouettes
+    from gdtool.diffusion.inference.result import move_depth_within_silhouettes
     from tests.fields.shapes import sphere, views_of
 
     cameras, images, mask = views_of(lambda points: sphere(points, 0.4), 64)
     pixel = cameras[0].pixel_size
-    moved = np.abs(within_silhouettes(images["depth"], mask, cameras) - images["depth"])[mask > 0.99]
+    moved = np.abs(move_depth_within_silhouettes(images["depth"], mask, cameras) - images["depth"])[mask > 0.99]
     # At the poles rows are as wide as the square root of their height.
     assert moved.max() < 3 * pixel
     assert moved.mean() < 0.2 * pixel
@@ -186,10 +189,10 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
     wrong = images["depth"].copy()
     wrong[names.index("right")] -= 0.1 * (mask[names.index("right")] > 0.5)
     wrong[names.index("front")] += 0.9 * (mask[names.index("front")] > 0.5)
-    found = within_silhouettes(wrong, mask, cameras)
+    result = move_depth_within_silhouettes(wrong, mask, cameras)
     for name in ("right", "front"):
         k = names.index(name)
-        points = backproject(cameras[k], found[k].astype(float))[mask[k] > 0.99]
+        points = backproject(cameras[k], result[k].astype(float))[mask[k] > 0.99]
         before = backproject(cameras[k], wrong[k].astype(float))[mask[k] > 0.99]
         # Within the ball's width in every row that the others show, though the ray alone would allow more.
         reach = np.hypot(points[:, 0], points[:, 2]) - np.sqrt(np.maximum(0.4**2 - points[:, 1] ** 2, 0))
@@ -197,25 +200,24 @@ def test_depth_stays_within_the_outlines_that_other_views_show():
         assert (np.hypot(before[:, 0], before[:, 2]) > 0.45).any()
     others = [k for k, name in enumerate(names) if name not in ("right", "front")]
     np.testing.assert_allclose(
-        found[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
+        result[others][mask[others] > 0.99], images["depth"][others][mask[others] > 0.99], atol=3 * pixel
     )
     flat = mask * 0
-    assert (within_silhouettes(wrong, flat, cameras) == wrong).all()
+    assert (move_depth_within_silhouettes(wrong, flat, cameras) == wrong).all()
     # Outlines of another object, at the very border of their pictures.
     elsewhere = mask.copy()
     elsewhere[1::2] = 0
     elsewhere[1::2, :, :2] = 1
-    found = within_silhouettes(images["depth"], elsewhere, cameras)
+    result = move_depth_within_silhouettes(images["depth"], elsewhere, cameras)
     inside = elsewhere > 0.5
-    assert found[inside].min() >= cameras[0].near
-    assert found[inside].max() <= cameras[0].far
+    assert result[inside].min() >= cameras[0].near
+    assert result[inside].max() <= cameras[0].far
 
 
-def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
-    """Of a wall that leans by a fifth of a pixel a row: no steps of whole pixels in the depth of the view that faces
-    it."""
+def test_an_outline_between_pixels_moves_depth_by_a_fraction_of_a_pixel():
+    """A wall leans by a fifth of a pixel a row: its depth in the facing view has no steps of whole pixels."""
     from gdtool.cameras import rig
-    from gdtool.diffusion.inference.result import within_silhouettes
+    from gdtool.diffusion.inference.result import move_depth_within_silhouettes
 
     size, lean = 64, 1 / 5
     cameras = rig("six", size)
@@ -227,6 +229,6 @@ def test_an_outline_between_pixels_keeps_depth_to_a_fraction_of_one():
     mask[front, :, 20:-20] = 1
     mask[right] = np.clip(edge[:, None] - np.abs(column + 0.5 - size / 2) + 0.5, 0, 1)
     depth = np.where(mask > 0, np.linalg.norm(cameras[front].position) - 0.5, 0).astype(np.float32)
-    found = within_silhouettes(depth, mask, cameras)[front, :, size // 2]
+    result = move_depth_within_silhouettes(depth, mask, cameras)[front, :, size // 2]
     wall = np.linalg.norm(cameras[front].position) - edge * pixel
-    np.testing.assert_allclose(found, wall, atol=0.1 * pixel)
+    np.testing.assert_allclose(result, wall, atol=0.1 * pixel)

@@ -1,4 +1,4 @@
-"""A model at twice the size starts as the small one's prediction, each pixel a square."""
+"""Check that a model grown to larger images predicts what the small one predicts, each pixel repeated to a square."""
 
 import msgspec
 import pytest
@@ -7,7 +7,7 @@ import torch
 from gdtool.core.errors import InputError
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.grow import grown, resized
+from gdtool.diffusion.network.grow import grow_weights, resize_config
 from gdtool.diffusion.network.model import Model
 
 SMALL = msgspec.structs.replace(PRESETS["tiny"][0], image_size=16, channels=(8, 16), head_width=8, encoder_width=16)
@@ -23,10 +23,10 @@ def random_model(config, seed=0):
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_a_grown_model_predicts_what_the_small_one_did(factor):
-    large_config = resized(SMALL, 16 * factor)
+    large_config = resize_config(SMALL, 16 * factor)
     small = random_model(SMALL)
     large = random_model(large_config, seed=1)
-    large.load_state_dict(grown(small.state_dict(), SMALL, large_config))
+    large.load_state_dict(grow_weights(small.state_dict(), SMALL, large_config))
     assert large.codec.side == small.codec.side  # as many tokens, so the same cost
     layout, views = Layout(1, (0, 1, 2), 6), torch.arange(6)
     generator = torch.Generator().manual_seed(2)
@@ -50,8 +50,8 @@ def test_a_grown_model_predicts_what_the_small_one_did(factor):
 
 def test_the_same_size_changes_nothing_and_another_network_is_refused():
     tensors = random_model(SMALL).state_dict()
-    assert grown(tensors, SMALL, SMALL) is tensors
+    assert grow_weights(tensors, SMALL, SMALL) is tensors
     with pytest.raises(InputError, match="cannot be grown"):
-        grown(tensors, SMALL, msgspec.structs.replace(resized(SMALL, 32), channels=(8, 32)))
+        grow_weights(tensors, SMALL, msgspec.structs.replace(resize_config(SMALL, 32), channels=(8, 32)))
     with pytest.raises(InputError, match="neither a multiple"):
-        resized(SMALL, 24)
+        resize_config(SMALL, 24)

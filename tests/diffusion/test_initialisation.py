@@ -1,4 +1,4 @@
-"""What is asked of Stable Diffusion Image Variations, and what is said of a repository that cannot be used as it is."""
+"""Check which files are requested of Stable Diffusion Image Variations, and the errors for unsuitable repositories."""
 
 import json
 import sys
@@ -19,14 +19,14 @@ PAPER = PRESETS["paper"][0]
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """A hub that gives tmp_path, and a record of what it was asked for."""
-    asked = []
-    stand_in = SimpleNamespace(snapshot_download=lambda name, **how: asked.append((name, how)) or str(tmp_path))
+    """Stand in for huggingface_hub: every download is tmp_path. Returns the list of requests."""
+    requests = []
+    stand_in = SimpleNamespace(snapshot_download=lambda name, **how: requests.append((name, how)) or str(tmp_path))
     monkeypatch.setitem(sys.modules, "huggingface_hub", stand_in)
-    return asked
+    return requests
 
 
-def test_the_second_version_is_asked_for(hub, tmp_path):
+def test_revision_2_is_requested_without_pickles(hub, tmp_path):
     (tmp_path / "unet").mkdir()
     (tmp_path / "unet" / "diffusion_pytorch_model.safetensors").touch()
     assert pretrained_part(PAPER, "unet") == tmp_path / "unet"
@@ -54,7 +54,7 @@ def test_a_local_folder_of_pickles_is_refused_by_the_files_name(tmp_path):
         pretrained_part(msgspec.structs.replace(PAPER, pretrained=str(tmp_path)), "vae")
 
 
-def test_it_is_no_multi_view_model(tmp_path):
+def test_it_is_refused_as_a_multi_view_model(tmp_path):
     (tmp_path / "unet").mkdir()
     (tmp_path / "unet" / "config.json").write_text(json.dumps({"in_channels": 4}))
     assert wonder3d.recognises(tmp_path)
@@ -62,20 +62,22 @@ def test_it_is_no_multi_view_model(tmp_path):
         wonder3d.load(tmp_path)
 
 
-def test_the_picture_is_resized_as_its_card_says_and_wonder3ds_as_clip_does():
-    """At a third of the size bicubic interpolation without antialiasing takes every third pixel, with it none alone."""
+def test_gdtool_resizes_pictures_without_antialiasing_and_wonder3d_with_it():
+    """At a third of the size, bicubic interpolation without antialiasing takes every third pixel; with it, no single
+    one.
+    """
     rows = torch.rand(3, 672, generator=torch.Generator().manual_seed(0))
     rgba = torch.cat([rows[:, :, None].expand(3, 672, 672) * 2 - 1, torch.ones(1, 672, 672)])[None]
     mean, deviation = (torch.tensor(x)[:, None] for x in (ClipEncoder.MEAN, ClipEncoder.DEVIATION))
-    given = []
+    resized = []
 
     class Clip(torch.nn.Module):
         def forward(self, image):
-            given.append(image[0, :, :, 5] * deviation + mean)
+            resized.append(image[0, :, :, 5] * deviation + mean)
             return SimpleNamespace(image_embeds=torch.zeros(1, 768))
 
     for convention in ("gdtool", "wonder3d"):
         ClipEncoder(msgspec.structs.replace(PAPER, convention=convention), Clip())(rgba)
-    torch.testing.assert_close(given[0], rows[:, 1::3], atol=1e-5, rtol=0)
-    assert (given[1] - rows[:, 1::3]).std() > 0.1
-    assert given[1].std() < 0.75 * rows.std()
+    torch.testing.assert_close(resized[0], rows[:, 1::3], atol=1e-5, rtol=0)
+    assert (resized[1] - rows[:, 1::3]).std() > 0.1
+    assert resized[1].std() < 0.75 * rows.std()

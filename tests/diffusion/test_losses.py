@@ -1,4 +1,4 @@
-"""Supervision by rendering: what it sees and what it does not."""
+"""Check the training losses: which maps the rendering loss depends on, and the weights of the image error."""
 
 import numpy as np
 import torch
@@ -48,7 +48,7 @@ def test_the_true_maps_have_no_error_and_changed_ones_have():
         assert float(error(changed, truth, planes, light)) < 1e-12
 
 
-def test_gradients_are_finite_at_every_adversary_and_point_to_the_truth():
+def test_gradients_are_finite_at_extreme_maps_and_point_to_the_truth():
     planes, truth, light = setting()
     for start in (torch.zeros_like(truth), torch.ones_like(truth), -torch.ones_like(truth)):
         predicted = start.requires_grad_()
@@ -61,7 +61,7 @@ def test_gradients_are_finite_at_every_adversary_and_point_to_the_truth():
     assert float(predicted.grad[3].sum()) > 0
 
 
-def test_an_empty_view_costs_nothing():
+def test_an_empty_view_has_no_rendering_error():
     planes, truth, light = setting()
     planes = planes.clone()
     planes[:, 12] = -1
@@ -99,18 +99,20 @@ def test_a_weighted_domain_counts_more_and_its_coverage_does_not():
         torch.testing.assert_close(weighted, factor * plain)
 
 
-def test_in_a_domain_compared_by_distance_a_median_is_best_and_coverage_stays_squared():
-    """Of three truths 0, 0 and 0.9, one estimate: the squared error is least at their mean, the distance at their
-    median."""
+def test_a_domain_compared_by_distance_prefers_the_median():
+    """Of one estimate for the truths 0, 0 and 0.9, the squared error is least at the mean, the distance at the median.
+
+    Coverage is always compared by its square.
+    """
     codec, base = make_codec(CONFIG), torch.zeros(36, 3, CONFIG.image_size, CONFIG.image_size)
     train = TrainConfig(absolute_domains=("normal", "depth"))
 
     def cost(domain, channels, estimate):
         guess, total = base.clone(), 0.0
         guess[domain * 6 : domain * 6 + 6, channels] = estimate
-        for one in (0.0, 0.0, 0.9):
+        for value in (0.0, 0.0, 0.9):
             target = base.clone()
-            target[domain * 6 : domain * 6 + 6, channels] = one
+            target[domain * 6 : domain * 6 + 6, channels] = value
             total += float(
                 image_error(codec.encode(guess), codec.encode(target), 1, tuple(range(6)), CONFIG, train)[0][0, domain]
             )

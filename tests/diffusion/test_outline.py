@@ -1,10 +1,10 @@
-"""What the picture shows and the guessed outlines leave out: drawn where it is, and nothing where they have room."""
+"""Check that parts which the picture shows and the sampled outlines lost are added to all views, and nothing else."""
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
 
-from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
+from gdtool.diffusion.inference.outline import add_part_to_masks, draw_part, find_lost_part
 from tests.fields.shapes import cube, sphere, torus, views_of
 
 SIZE = 96
@@ -19,28 +19,28 @@ def ball_with_post(points):
 
 
 @pytest.fixture(scope="module")
-def seen():
-    """The views, and their masks with the post faded out of all but the front and the back one."""
+def views():
+    """Return views of a ball with a post, and masks in which only the front and the back view show the post."""
     cameras, images, mask = views_of(ball_with_post, SIZE)
     ball = views_of(lambda points: sphere(points, 0.3), SIZE)[2]
     guessed = np.array(
         [
-            own if camera.name in ("front", "back") else np.minimum(own, np.maximum(without, 0.2))
-            for camera, own, without in zip(cameras, mask, ball, strict=True)
+            with_post if camera.name in ("front", "back") else np.minimum(with_post, np.maximum(without, 0.2))
+            for camera, with_post, without in zip(cameras, mask, ball, strict=True)
         ]
     )
     return cameras, images, mask, guessed
 
 
 @pytest.mark.parametrize("deep", [True, False])
-def test_a_post_that_the_guessed_views_lost_is_put_where_it_stands(seen, deep):
-    cameras, images, mask, guessed = seen
+def test_a_post_that_the_sampled_views_lost_is_placed_correctly(views, deep):
+    cameras, images, mask, guessed = views
     front = [camera.name for camera in cameras].index("front")
     pixel = cameras[0].pixel_size
     known = np.where(guessed >= 0.5, guessed, 0)
-    part = lost_part(guessed, known, cameras, front, images["depth"][front] if deep else None)
+    part = find_lost_part(guessed, known, cameras, front, images["depth"][front] if deep else None)
     assert np.abs(part.middle - (2 - FORWARD))[part.lost].mean() < pixel
-    grown = grown_masks(part, known, cameras, front)
+    grown = add_part_to_masks(part, known, cameras, front)
     for k in range(len(cameras)):
         post = (mask[k] > 0.5) & (known[k] <= 0.5)
         assert (grown[k] >= known[k]).all()
@@ -50,21 +50,21 @@ def test_a_post_that_the_guessed_views_lost_is_put_where_it_stands(seen, deep):
             assert beyond.sum() < 8  # where it joins the ball
 
 
-def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
-    cameras, images, mask, guessed = seen
+def test_every_view_shows_the_part_with_the_known_views_values(views):
+    cameras, images, mask, guessed = views
     names = [camera.name for camera in cameras]
     front, right = names.index("front"), names.index("right")
     known = np.where(guessed >= 0.5, guessed, 0)
     wrong = {
         domain: np.where((known > 0.5).reshape(known.shape + (1,) * (x.ndim - 3)), x, 0) for domain, x in images.items()
     }
-    part = lost_part(guessed, known, cameras, front, images["depth"][front])
+    part = find_lost_part(guessed, known, cameras, front, images["depth"][front])
     before = {domain: x.copy() for domain, x in wrong.items()}
     draw_part(part, wrong, known, cameras, front)
     for domain in set(wrong) - {"depth"}:
-        shown = known > 0.5
-        np.testing.assert_array_equal(wrong[domain][shown], before[domain][shown])
-    post = (mask[right] > 0.9) & (known[right] <= 0.5) & (grown_masks(part, known, cameras, front)[right] > 0.5)
+        covered = known > 0.5
+        np.testing.assert_array_equal(wrong[domain][covered], before[domain][covered])
+    post = (mask[right] > 0.9) & (known[right] <= 0.5) & (add_part_to_masks(part, known, cameras, front)[right] > 0.5)
     off = wrong["depth"][right] - images["depth"][right]
     assert post.sum() > 40
     assert np.abs(off[post]).mean() < 2 * cameras[0].pixel_size
@@ -76,7 +76,7 @@ def test_every_view_shows_the_part_as_the_known_one_has_it(seen):
 
 
 @pytest.mark.parametrize("solid", [sphere, cube, torus, ball_with_post])
-def test_views_that_have_room_for_all_of_the_picture_are_left_alone(solid):
+def test_views_with_space_for_all_of_the_picture_stay(solid):
     cameras, images, mask = views_of(solid, 64)
     front = [camera.name for camera in cameras].index("front")
-    assert lost_part(mask, mask, cameras, front, images["depth"][front]) is None
+    assert find_lost_part(mask, mask, cameras, front, images["depth"][front]) is None

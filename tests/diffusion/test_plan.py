@@ -1,4 +1,4 @@
-"""What --plan computes without data or numbers, against what a small step does."""
+"""Check the cost that --plan predicts without computing values against the cost of small real steps."""
 
 import msgspec
 import pytest
@@ -9,7 +9,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model, parameter_count
-from gdtool.diffusion.reports.plan import frozen_cost, phase_cost, plan_of, rendering_share, step_cost
+from gdtool.diffusion.reports.plan import frozen_cost, make_plan, phase_cost, rendering_share, step_cost
 from gdtool.diffusion.training.loop import new_state, train_step
 from tests.diffusion.test_training import spheres
 
@@ -39,8 +39,8 @@ def test_flops_are_those_of_a_real_step(checkpointing):
 
 
 @pytest.mark.parametrize("checkpointing", [False, True])
-def test_memory_is_what_the_profiler_sees(checkpointing):
-    """The allocator's own events of a real step, their running sum's maximum, less the gradients that stay."""
+def test_memory_is_what_the_profiler_measures(checkpointing):
+    """The measured peak is that of the sum over the allocator's events, without the gradients."""
     config = msgspec.structs.replace(CONFIG, gradient_checkpointing=checkpointing)
     profiler = profile(activities=[ProfilerActivity.CPU], profile_memory=True)
     model = measured_step(config, 2, profiler)
@@ -61,7 +61,7 @@ def peak_of(profiler) -> int:
 
 @pytest.fixture
 def with_vae(tmp_path):
-    """A configuration with a VAE of Stable Diffusion's structure and a few thousand weights."""
+    """Return a configuration with a VAE of Stable Diffusion's structure and a few thousand weights."""
     diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")
     blocks = {"block_out_channels": (8, 8, 8, 8), "norm_num_groups": 4, "latent_channels": 4}
     diffusers.AutoencoderKL(
@@ -73,8 +73,10 @@ def with_vae(tmp_path):
 
 
 def real_and_planned(config, rendering):
-    """(FLOPs, peak bytes less gradients) of a train_step of two objects, all six domains, and what is planned for
-    it."""
+    """Measure a train_step of two objects in all six domains, and predict its cost.
+
+    Returns (FLOPs, peak bytes without gradients) twice: measured and planned.
+    """
     phase = Phase(domains=6, views=2)
     train = msgspec.structs.replace(
         PRESETS["tiny"][1],
@@ -85,7 +87,7 @@ def real_and_planned(config, rendering):
         tilted=0.0,
         hue=False,
         mirror=False,
-        # Every object has less noise than that.
+        # Every object has an SNR above this.
         pbr_weight=0.1 if rendering else 0.0,
         pbr_snr=-1.0,
     )
@@ -140,7 +142,7 @@ def test_a_plan_adds_up():
         steps=10,
         phases=(Phase(share=0.5, domains=1, views=2), Phase(domains=6, views=6)),
     )
-    plan = plan_of(CONFIG, train)
+    plan = make_plan(CONFIG, train)
     assert plan["weights"] == parameter_count(Model(CONFIG))
     assert plan["weights_bytes"] == 20 * plan["weights"]
     assert [p["steps"] for p in plan["phases"]] == [5, 5]

@@ -1,5 +1,4 @@
-"""The paper's configuration with Stable Diffusion's parts: diffusers and transformers on small random weights of the
-same structure."""
+"""Check the paper's configuration with Stable Diffusion's parts, on small random weights of the same structure."""
 
 import json
 
@@ -29,7 +28,9 @@ CHANGES = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """vae/, image_encoder/ and unet/ as Stable Diffusion Image Variations has them, a few thousand weights each."""
+    """Write unet/, vae/ and image_encoder/ as Stable Diffusion Image Variations has them, small and with random
+    weights.
+    """
     path = tmp_path_factory.mktemp("small-sd")
     torch.manual_seed(0)
     blocks = {"block_out_channels": (8, 8, 8, 8), "norm_num_groups": 4, "latent_channels": 4}
@@ -65,13 +66,13 @@ def model(folder):
         PRESETS["paper"][0], pretrained=str(folder), gradient_checkpointing=False, **CHANGES
     )
     torch.manual_seed(1)
-    own = Model(config)
-    start_from_pretrained(own)
-    return own.eval()
+    network = Model(config)
+    start_from_pretrained(network)
+    return network.eval()
 
 
-def test_one_image_gets_what_diffusers_network_gives_it(folder, model):
-    """Independent of our code: the published implementation of the structure, on the same weights."""
+def test_one_image_gets_the_output_of_diffusers_network(folder, model):
+    """Compare with diffusers' implementation of the same structure on the same weights."""
     reference = diffusers.UNet2DConditionModel.from_pretrained(folder / "unet", use_safetensors=True).eval()
     noisy, context, t = torch.randn(1, 4, 8, 8), torch.randn(1, 1, 24), torch.tensor([321])
     label = torch.zeros(1, 18)
@@ -79,23 +80,23 @@ def test_one_image_gets_what_diffusers_network_gives_it(folder, model):
         # the class embedding is new; what it adds to the time embedding is taken off again
         embedded = model.unet.class_embedding(label)
         model.unet.class_embedding.linear_2.bias -= embedded[0]
-        own = model.unet(noisy, torch.randn(1, 4, 8, 8), t, label, context, Layout(1, (0,), 1))
+        output = model.unet(noisy, torch.randn(1, 4, 8, 8), t, label, context, Layout(1, (0,), 1))
         model.unet.class_embedding.linear_2.bias += embedded[0]
         expected = reference(noisy, t, context).sample
-    torch.testing.assert_close(own, expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(output, expected, atol=1e-5, rtol=1e-4)
 
 
 def test_every_pretrained_tensor_is_used(folder, model):
     tensors, _ = read_tensors(folder / "unet" / "diffusion_pytorch_model.safetensors")
-    own = model.unet.state_dict()
+    state = model.unet.state_dict()
     assert len(tensors) > 300
     for name, tensor in tensors.items():
-        taken = own[name][:, : tensor.shape[1]] if tensor.ndim > 1 else own[name]
-        torch.testing.assert_close(taken, tensor, msg=name)
+        loaded = state[name][:, : tensor.shape[1]] if tensor.ndim > 1 else state[name]
+        torch.testing.assert_close(loaded, tensor, msg=name)
 
 
 def test_the_image_encoder_is_clips(folder, model):
-    """Half grey is what a mean image is to CLIP: compared with transformers' own pre-processing."""
+    """Compare with transformers' CLIP on an image of half grey, which is 0 in [-1, 1]."""
     reference = transformers.CLIPVisionModelWithProjection.from_pretrained(folder / "image_encoder").eval()
     rgba = torch.zeros(1, 4, 64, 64)
     mean, deviation = (torch.tensor(x)[:, None, None] for x in (model.encoder.MEAN, model.encoder.DEVIATION))
@@ -105,7 +106,7 @@ def test_the_image_encoder_is_clips(folder, model):
 
 
 def test_trains_and_samples_by_command(folder, gdtool, tmp_path):
-    """From pretrained parts through train to views that validate."""
+    """Train from pretrained parts, sample with the result, and validate the views."""
     spheres = write_spheres(tmp_path / "spheres", size=64)
     changes = {
         "model": CHANGES | {"pretrained": str(folder)},

@@ -1,4 +1,4 @@
-"""Noise levels, predictions and samplers on problems with known answers."""
+"""Check noise levels, predictions and samplers on problems with known answers."""
 
 import math
 
@@ -73,7 +73,10 @@ def test_a_known_image_is_reached_exactly(scheduler):
 
 
 def gaussian_error(scheduler, steps):
-    """Data N(0, 2²): E[x_0 | x] = a 4 x / (4 a² + s²); the exact flow maps noise z to 2 z."""
+    """Return the error of sampling data N(0, 2²), for which the exact flow maps noise z to 2 z.
+
+    The best prediction is E[x_0 | x] = a 4 x / (4 a² + s²).
+    """
     a, s = (x.double() for x in alpha_and_sigma(SD))
 
     def denoise(x, t, i):

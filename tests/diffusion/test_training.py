@@ -1,4 +1,4 @@
-"""Training: data, augmentation, the loop, exact resume."""
+"""Check training: batches, augmentation, the loop, and exact resuming."""
 
 import csv
 
@@ -11,11 +11,11 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import PRESETS, Phase
 from gdtool.diffusion.data.objects import (
-    LIGHTS,
+    LIGHT_COUNT,
     Objects,
-    draw,
+    draw_batch,
     from_bytes,
-    mirror,
+    mirror_object,
     object_order,
     permute_colors,
     to_bytes,
@@ -29,7 +29,7 @@ from gdtool.diffusion.training.loop import (
     CHECKPOINT,
     Observers,
     RunOptions,
-    choose,
+    choose_step,
     learning_rate,
     new_state,
     phase_at,
@@ -47,7 +47,7 @@ def spheres(count=4, size=16) -> Objects:
         views = sphere_views(seed, size)
         planes.append(planes_from_images(views.images, views.mask))
         conditions.append(planes[-1][0][[0, 1, 2, 12]])
-    light = np.zeros((LIGHTS, 7), np.float32)
+    light = np.zeros((LIGHT_COUNT, 7), np.float32)
     light[:, 2] = 1
     light[:2] = np.concatenate([LIGHT["axes"], np.array(LIGHT["sharpness"])[:, None], LIGHT["amplitudes"]], 1)
     return Objects(
@@ -67,8 +67,8 @@ def test_bytes_keep_zero_exactly():
 def test_mirroring_swaps_sides_and_is_its_own_inverse():
     objects = spheres(1, 32)
     args = from_bytes(objects.planes[0]), from_bytes(objects.conditions[0, 0]), torch.from_numpy(objects.lights[0])
-    once = mirror(*args, MODEL.views)
-    for a, b in zip(args, mirror(*once, MODEL.views), strict=True):
+    once = mirror_object(*args, MODEL.views)
+    for a, b in zip(args, mirror_object(*once, MODEL.views), strict=True):
         torch.testing.assert_close(a, b)
     right, left = (MODEL.views.index(v) for v in ("right", "left"))
     albedo = once[0][:, PLANES["albedo"]]
@@ -97,29 +97,29 @@ def test_permuted_colors_permute_the_light_as_well():
 
 
 def test_each_pass_shows_each_object_once():
-    seen = np.concatenate([object_order(6, step, 4, seed=1) for step in range(3)])
-    assert sorted(seen[:6]) == list(range(6)) == sorted(seen[6:])
+    order = np.concatenate([object_order(6, step, 4, seed=1) for step in range(3)])
+    assert sorted(order[:6]) == list(range(6)) == sorted(order[6:])
     assert (object_order(6, 1, 4, 1) == object_order(6, 1, 4, 1)).all()
     assert (object_order(50, 0, 50, 1) != object_order(50, 0, 50, 2)).any()
 
 
-def test_steps_see_color_and_as_many_domains_and_views_as_the_phase_says():
+def test_steps_have_color_and_the_phases_number_of_domains_and_views():
     for step in range(5):
-        drawn = choose(MODEL, Phase(domains=3, views=2), 0, step)
-        assert drawn.domains[0] == 0
-        assert len(set(drawn.domains)) == 3
-        assert len(drawn.views.unique()) == 2
-    assert choose(MODEL, Phase(), 0, 0).domains == tuple(range(6))
+        chosen = choose_step(MODEL, Phase(domains=3, views=2), 0, step)
+        assert chosen.domains[0] == 0
+        assert len(set(chosen.domains)) == 3
+        assert len(chosen.views.unique()) == 2
+    assert choose_step(MODEL, Phase(), 0, 0).domains == tuple(range(6))
 
 
-def test_a_phase_may_have_a_batch_of_its_own(monkeypatch):
-    drawn = []
+def test_a_phase_may_set_its_batch_size(monkeypatch):
+    batches = []
     monkeypatch.setattr(
-        training, "draw", lambda objects, idx, *rest: drawn.append(len(idx)) or draw(objects, idx, *rest)
+        training, "draw_batch", lambda objects, idx, *rest: batches.append(len(idx)) or draw_batch(objects, idx, *rest)
     )
     train = msgspec.structs.replace(TRAIN, phases=(Phase(share=1.0, domains=1, views=1, batch=3),))
     training.train_step(new_state(Model(MODEL), train), spheres(), train, 0, None, "cpu")
-    assert sum(drawn) == 3 != TRAIN.batch
+    assert sum(batches) == 3 != TRAIN.batch
 
 
 def test_phases_and_rate_follow_progress():
@@ -189,7 +189,7 @@ def test_a_killed_run_resumes_bit_for_bit(tmp_path, precision):
 
 
 def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
-    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    monkeypatch.setattr(optimizer, "MIN_MUON_SIDE", 8)
     whole = train(tmp_path / "a", None, optimizer="muon")
     assert len(whole.optimizer.matrices) > 20
     train(tmp_path / "b", 7, optimizer="muon")
@@ -202,12 +202,12 @@ def test_a_killed_run_with_muon_resumes_bit_for_bit(tmp_path, monkeypatch):
 
 
 def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
-    monkeypatch.setattr(optimizer, "SMALLEST", 8)
+    monkeypatch.setattr(optimizer, "MIN_MUON_SIDE", 8)
     model = Model(MODEL)
-    own = optimizer.make_optimizer(model, msgspec.structs.replace(TRAIN, optimizer="muon", weight_decay=0.0))
-    for group in own.param_groups:
+    muon = optimizer.make_optimizer(model, msgspec.structs.replace(TRAIN, optimizer="muon", weight_decay=0.0))
+    for group in muon.param_groups:
         group["lr"] = 1e-3 * group["rate"]
-    p = own.matrices[0]
+    p = muon.matrices[0]
     before = p.detach().clone()
     generator = torch.Generator().manual_seed(0)
     # a gradient that is nearly of rank one: AdamW would move the same way everywhere
@@ -215,10 +215,10 @@ def test_muon_moves_a_matrix_alike_in_all_its_directions(monkeypatch):
         torch.randn(p.shape[0], generator=generator), torch.randn(p[0].numel(), generator=generator)
     ).view(p.shape)
     p.grad += 0.05 * torch.randn(p.shape, generator=generator)
-    own.step()
-    given, moved = (torch.linalg.svdvals(x.flatten(1)) for x in (p.grad, p.detach() - before))
-    middle = len(given) // 2
-    assert given[0] / given[middle] > 20
+    muon.step()
+    gradient, moved = (torch.linalg.svdvals(x.flatten(1)) for x in (p.grad, p.detach() - before))
+    middle = len(gradient) // 2
+    assert gradient[0] / gradient[middle] > 20
     assert moved[0] / moved[middle] < 3  # Newton-Schulz brings singular values near 1
 
 
@@ -256,7 +256,7 @@ def test_training_lowers_the_error(tmp_path):
 
 
 def poisoned(monkeypatch, bad):
-    """losses() whose gradient is not finite in the steps of which bad(number) holds."""
+    """Make the gradient of losses() not finite in the steps for which bad(number) is true."""
     plain = training.losses
 
     def losses(model, batch, step, *rest):
@@ -266,19 +266,19 @@ def poisoned(monkeypatch, bad):
     monkeypatch.setattr(training, "losses", losses)
 
 
-def test_steps_that_are_not_finite_are_left_out_counted_and_told(tmp_path, monkeypatch):
+def test_steps_with_a_gradient_that_is_not_finite_are_skipped_with_a_warning(tmp_path, monkeypatch):
     poisoned(monkeypatch, lambda number: number in (1, 2, 5))
-    said = []
+    warnings = []
     state = run_training(
         Model(MODEL),
         spheres(),
         msgspec.structs.replace(TRAIN, steps=7),
         tmp_path,
         RunOptions(seed=0),
-        observers=Observers(warn=said.append),
+        observers=Observers(warn=warnings.append),
     )
-    assert [line.split(" is left out")[0] for line in said] == ["step 2", "step 3", "step 6"]
-    assert "2 in a row" in said[1]
+    assert [line.split(" is left out")[0] for line in warnings] == ["step 2", "step 3", "step 6"]
+    assert "2 in a row" in warnings[1]
     assert [row["skipped"] for row in csv.DictReader((tmp_path / "loss.csv").read_text().splitlines())] == list(
         "0110010"
     )

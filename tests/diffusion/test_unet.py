@@ -1,4 +1,4 @@
-"""The network's structure: Stable Diffusion's names, conditioning, and what starts unchanged."""
+"""Check the network's structure: Stable Diffusion's names, conditioning, and which parts start without effect."""
 
 import msgspec
 import pytest
@@ -9,7 +9,7 @@ from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.encoding import mirrored
+from gdtool.diffusion.network.encoding import mirror_images
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.unet import UNet
 
@@ -20,7 +20,7 @@ PAPER = PRESETS["paper"][0]
 def test_the_paper_preset_has_stable_diffusions_keys_and_size():
     with torch.device("meta"):
         unet = UNet(PAPER, 4, 4, 32)
-    own = {name: tuple(p.shape) for name, p in unet.state_dict().items()}
+    shapes = {name: tuple(p.shape) for name, p in unet.state_dict().items()}
     for name, shape in {
         "conv_in.weight": (320, 8, 3, 3),
         "time_embedding.linear_1.weight": (1280, 320),
@@ -38,7 +38,7 @@ def test_the_paper_preset_has_stable_diffusions_keys_and_size():
         "conv_norm_out.weight": (320,),
         "conv_out.weight": (4, 320, 3, 3),
     }.items():
-        assert own[name] == shape, name
+        assert shapes[name] == shape, name
     new = ("cross_domain", "class_embedding")
     original = sum(p.numel() for name, p in unet.named_parameters() if not any(part in name for part in new))
     # Stable Diffusion 1's UNet has 859,520,964 parameters; ours has four more input channels
@@ -46,7 +46,10 @@ def test_the_paper_preset_has_stable_diffusions_keys_and_size():
 
 
 def small_stable_diffusion():
-    """A UNet as Stable Diffusion has it (4 input channels, no classes, no star), small, with its weights."""
+    """Return this network, Stable Diffusion's, and the weights of the latter, all small.
+
+    Stable Diffusion's has 4 input channels, no classes and no attention across domains.
+    """
     config = msgspec.structs.replace(
         PAPER, channels=(8, 16, 16, 16), heads=2, norm_groups=4, encoder_width=12, gradient_checkpointing=False
     )
@@ -58,8 +61,10 @@ def small_stable_diffusion():
 
 
 def test_pretrained_weights_start_unchanged():
-    """Loaded into the grown network, every image gets what the original network gives it: the new parts add nothing
-    (one view, so that multi-view attention is self-attention; class labels off)."""
+    """Load pretrained weights into the network with its new parts: every image gets the original network's output.
+
+    There is one view, so that multi-view attention is self-attention, and the class embedding is zero.
+    """
     grown, plain, weights = small_stable_diffusion()
     new = load_stable_diffusion(grown, weights)
     assert all("cross_domain" in name or "class_embedding" in name for name in new)
@@ -87,7 +92,7 @@ def test_pretrained_weights_that_do_not_fit_are_named():
 def tiny(**changes):
     torch.manual_seed(0)
     model = Model(msgspec.structs.replace(TINY, **changes)).eval()
-    for p in model.parameters():  # nothing at zero, so that every path shows
+    for p in model.parameters():  # no weight at zero, so that every path has an effect
         if p.ndim >= 2 and not p.any():
             torch.nn.init.normal_(p, std=0.05)
     return model
@@ -132,7 +137,7 @@ def test_an_untrained_x_model_shows_the_condition_as_front_color():
 
 
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
-def test_objects_of_a_batch_do_not_meet(guidance):
+def test_objects_of_a_batch_are_independent(guidance):
     model = tiny()
     rgba = torch.rand(2, 4, 16, 16) * 2 - 1
     both = sample_images(model, rgba, SamplingOptions(steps=2, seed=4, guidance=guidance))
@@ -141,19 +146,19 @@ def test_objects_of_a_batch_do_not_meet(guidance):
         torch.testing.assert_close(both[domain][1], alone[domain][0], rtol=1e-4, atol=1e-5)
 
 
-def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
-    model, seen = tiny(), []
+def test_guidance_acts_and_costs_only_between_its_timesteps(monkeypatch):
+    model, batches = tiny(), []
     rgba = torch.rand(1, 4, 16, 16) * 2 - 1
     whole = model.predict_clean
-    monkeypatch.setattr(model, "predict_clean", lambda x, *rest: seen.append(len(x)) or whole(x, *rest))
+    monkeypatch.setattr(model, "predict_clean", lambda x, *rest: batches.append(len(x)) or whole(x, *rest))
     plain, all_over = (
         sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=guidance)) for guidance in (1.0, 2.5)
     )
-    one = seen[0]
-    assert seen == [one] * 4 + [2 * one] * 4
-    seen.clear()
+    images = batches[0]
+    assert batches == [images] * 4 + [2 * images] * 4
+    batches.clear()
     early = sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=2.5, guided_from=0.6))
-    assert seen == [2 * one] * 2 + [one] * 2
+    assert batches == [2 * images] * 2 + [images] * 2
     never = sample_images(model, rgba, SamplingOptions(steps=4, seed=4, guidance=2.5, guided_to=0.0, guided_from=1.0))
     for domain in plain:
         assert torch.equal(never[domain], plain[domain])
@@ -162,35 +167,37 @@ def test_guidance_costs_and_acts_between_its_timesteps_alone(monkeypatch):
 
 
 @pytest.mark.parametrize("guidance", [1.0, 2.5])
-def test_sampled_with_its_mirror_image_a_picture_gives_the_mirrored_views_of_the_turned_picture(guidance):
-    """At one step, where noise of no weight says nothing; at two both sides of the mean have mirrored noise, so each
-    object is whole."""
+def test_sampling_with_the_mirror_image_is_equivariant_to_mirroring(guidance):
+    """A mirrored picture gives the mirrored views, in one step, in which the noise has no weight.
+
+    In two steps the result of an object does not depend on the rest of its batch.
+    """
     model = tiny(noisy_input="shrunk")
     rgba = torch.rand(2, 4, 16, 16) * 2 - 1
     plain = sample_images(model, rgba, SamplingOptions(steps=1, guidance=guidance))
-    one, other = (
+    of_picture, of_mirrored = (
         sample_images(model, x, SamplingOptions(steps=1, guidance=guidance, mirror=True)) for x in (rgba, rgba.flip(-1))
     )
-    whole, turned, apart = (torch.stack([of[d] for d in TINY.domains], 1) for of in (one, other, plain))
-    torch.testing.assert_close(mirrored(turned, tuple(range(6)), TINY.views), whole, rtol=1e-4, atol=1e-4)
-    assert float((apart - whole).abs().mean()) > 1e-3  # the network itself knows of no mirror
+    whole, mirrored, apart = (torch.stack([of[d] for d in TINY.domains], 1) for of in (of_picture, of_mirrored, plain))
+    torch.testing.assert_close(mirror_images(mirrored, tuple(range(6)), TINY.views), whole, rtol=1e-4, atol=1e-4)
+    assert float((apart - whole).abs().mean()) > 1e-3  # the network alone is not equivariant
     two = sample_images(model, rgba[1:], SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))
     both = sample_images(model, rgba, SamplingOptions(steps=2, seed=4, guidance=guidance, mirror=True))
     for domain in both:
         torch.testing.assert_close(both[domain][1], two[domain][0], rtol=1e-4, atol=1e-5)
 
 
-def test_only_a_model_of_pixels_is_sampled_with_the_mirror_image():
+def test_only_a_patch_codec_samples_with_the_mirror_image():
     with pytest.raises(InputError, match="mirror"):
         sample_images(tiny(convention="wonder3d"), torch.rand(1, 4, 16, 16), SamplingOptions(steps=1, mirror=True))
     half = tiny(sampling_mirrored=True, views=("front", "right"))
     with pytest.raises(InputError, match="both sides"):
         sample_images(half, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1, mirror=True))
-    # The preset asks, the model cannot.
+    # The configuration asks for mirroring, the model cannot mirror its views.
     assert sample_images(half, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1))["color"].shape[1] == 2
 
 
-def test_domains_that_are_not_asked_for_are_not_computed():
+def test_domains_that_are_not_requested_are_not_computed():
     model = tiny()
     rgba = torch.rand(1, 4, 16, 16)
     assert set(sample_images(model, rgba, SamplingOptions(steps=1, domains=("depth",)))) == {"color", "depth"}

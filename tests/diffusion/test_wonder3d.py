@@ -1,4 +1,4 @@
-"""Wonder3D's published structure: its block restated plainly, its numbers, its folder loaded and sampled."""
+"""Check Wonder3D's published structure: its block, its camera labels, and a folder that is loaded and sampled."""
 
 import json
 import pickle
@@ -27,7 +27,7 @@ SMALL = {
 
 
 def heads_attend(weights, name, queries, keys, heads=2):
-    """Multi-head attention of (t, c) to (s, e), head by head."""
+    """Attend from queries (t, c) to keys (s, e), head by head."""
     q, k, v = (
         queries @ weights[f"{name}.to_q.weight"].T,
         keys @ weights[f"{name}.to_k.weight"].T,
@@ -51,9 +51,11 @@ def normed(weights, name, x):
 
 
 def plain_block(weights, normal, color, context, last=False):
-    """normal, color: a list of views (t, c) each. Image by image: all views of the own domain; then, of the own view,
-    both domains; then the picture's embedding; then the gated feed-forward (and with `last`, both domains only
-    here)."""
+    """Apply Wonder3D's block to each image separately; normal and color are lists of views (t, c).
+
+    An image attends to all views of its domain, then to both domains of its view, then to the picture's embedding. A
+    gated feed-forward follows. With `last`, attention across domains comes after the feed-forward instead.
+    """
 
     def joined(domains, place):
         name = f"attn_joint_{place}"
@@ -96,17 +98,17 @@ def test_the_block_is_wonder3ds(place):
     layout = Layout(2, (0, 1), 3)  # two objects, as the two halves of classifier-free guidance are
     x = torch.randn(layout.images, 4, 16, dtype=torch.float64)
     context = torch.randn(2, 1, 8, dtype=torch.float64)
-    own = block(x, context, layout).view(2, 2, 3, 4, 16)
+    output = block(x, context, layout).view(2, 2, 3, 4, 16)
     parts = x.view(2, 2, 3, 4, 16)
     for b in range(2):
         normal, color = plain_block(
             block.state_dict(), list(parts[b, 1]), list(parts[b, 0]), context[b], place == "joint_last"
         )
-        torch.testing.assert_close(own[b, 1], torch.stack(normal))
-        torch.testing.assert_close(own[b, 0], torch.stack(color))
+        torch.testing.assert_close(output[b, 1], torch.stack(normal))
+        torch.testing.assert_close(output[b, 0], torch.stack(color))
 
 
-def test_the_new_attention_starts_as_its_bias_alone():
+def test_joint_attention_starts_with_zero_weights():
     torch.manual_seed(0)
     block = TransformerBlock(16, 2, 8, 4, True, "joint")
     assert not block.attn_joint_mid.to_out[0].weight.any()
@@ -124,11 +126,11 @@ def test_camera_embedding_verbatim():
 
 
 def test_older_names_are_read():
-    assert wonder3d.renamed("a.attn_joint_twice.to_q.weight") == "a.attn_joint_mid.to_q.weight"
-    assert wonder3d.renamed("a.norm_joint_twice.bias") == "a.norm_joint_mid.bias"
-    assert wonder3d.renamed("a.attn_joint.to_out.0.bias") == "a.attn_joint_last.to_out.0.bias"
-    assert wonder3d.renamed("a.norm_joint_mid.weight") == "a.norm_joint_mid.weight"
-    assert wonder3d.renamed("down_blocks.0.attn1.to_q.weight") == "down_blocks.0.attn1.to_q.weight"
+    assert wonder3d.translate_key("a.attn_joint_twice.to_q.weight") == "a.attn_joint_mid.to_q.weight"
+    assert wonder3d.translate_key("a.norm_joint_twice.bias") == "a.norm_joint_mid.bias"
+    assert wonder3d.translate_key("a.attn_joint.to_out.0.bias") == "a.attn_joint_last.to_out.0.bias"
+    assert wonder3d.translate_key("a.norm_joint_mid.weight") == "a.norm_joint_mid.weight"
+    assert wonder3d.translate_key("down_blocks.0.attn1.to_q.weight") == "down_blocks.0.attn1.to_q.weight"
 
 
 def test_white_background_of_normals_becomes_coverage():
@@ -176,8 +178,10 @@ def test_a_pickle_that_runs_code_is_not_run(tmp_path):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The published layout, small and random; its UNet's keys are diffusers' own and the attention that Wonder3D
-    adds."""
+    """Write the published layout with small random weights.
+
+    The UNet's keys are diffusers' and those of Wonder3D's joint attention.
+    """
     diffusers = pytest.importorskip("diffusers", reason="needs pip install 'gdtool[hub]'")
     transformers = pytest.importorskip("transformers", reason="needs pip install 'gdtool[hub]'")
     from safetensors.torch import save_file
@@ -226,44 +230,46 @@ def folder(tmp_path_factory):
 def test_every_key_is_used_and_none_is_missing(folder):
     model = wonder3d.load(folder)
     stored, _ = read_tensors(folder / wonder3d.UNET)
-    own = model.unet.state_dict()
-    assert own.keys() == stored.keys()
-    assert len([k for k in own if "joint_mid" in k]) == 16 * 7
-    assert all(torch.equal(own[k], stored[k]) for k in own)
+    state = model.unet.state_dict()
+    assert state.keys() == stored.keys()
+    assert len([k for k in state if "joint_mid" in k]) == 16 * 7
+    assert all(torch.equal(state[k], stored[k]) for k in state)
     assert model.config.cross_domain == "joint"
     assert model.config.image_size == 64
 
 
-def test_without_joint_attention_an_image_gets_what_diffusers_gives_it(folder):
-    """The camera embedding with its labels, and every residual block: against the published implementation."""
+def test_without_joint_attention_an_image_gets_diffusers_output(folder):
+    """Compare with diffusers' implementation: the class embedding with its labels, and every residual block."""
     import diffusers
 
     model = wonder3d.load(folder)
     for name, p in model.unet.named_parameters():
         if "attn_joint_mid.to_out" in name:
             p.zero_()
-    own = model.unet.config
     reference = diffusers.UNet2DConditionModel.from_config(json.loads((folder / "unet/config.json").read_text()))
     reference.load_state_dict({k: v for k, v in model.unet.state_dict().items() if "joint" not in k})
     noisy, condition, context = torch.randn(2, 4, 8, 8), torch.randn(2, 4, 8, 8), torch.randn(1, 1, 24)
     label = model.labels[[0, 1], 2]
     with torch.no_grad():
-        given = model.unet(noisy, condition, torch.tensor([400]), label, context, Layout(1, (0, 1), 1))
+        output = model.unet(noisy, condition, torch.tensor([400]), label, context, Layout(1, (0, 1), 1))
         expected = reference.eval()(
             torch.cat([noisy, condition], 1), 400, context.expand(2, -1, -1), class_labels=label
         ).sample
-    torch.testing.assert_close(given, expected, atol=2e-5, rtol=1e-4)
-    assert own.prediction == "epsilon"
+    torch.testing.assert_close(output, expected, atol=2e-5, rtol=1e-4)
+    assert model.unet.config.prediction == "epsilon"
 
 
-def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
-    """One step at guidance 3, restated: without = zero embedding, zero latent, the same camera labels."""
+def test_guidance_extrapolates_from_no_condition_to_the_condition(folder):
+    """Compute one step at guidance 3 separately.
+
+    No condition means a zero embedding and a zero latent, with the same camera labels.
+    """
     from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
     from gdtool.diffusion.network.encoding import encode_condition
 
     model = wonder3d.load(folder)
     rgba = torch.rand(1, 4, 64, 64) * 2 - 1
-    given = sample_images(model, rgba, SamplingOptions(domains=("color", "normal"), steps=1, guidance=3.0, seed=5))
+    sampled = sample_images(model, rgba, SamplingOptions(domains=("color", "normal"), steps=1, guidance=3.0, seed=5))
     layout, views = Layout(1, (0, 1), 6), torch.arange(6)
     noise = torch.randn(36, 4, 8, 8, generator=torch.Generator().manual_seed(5))[:12]
     white = encode_condition(rgba, torch.ones(1))
@@ -275,7 +281,7 @@ def test_guidance_is_the_step_from_nothing_to_the_condition(folder):
         clean = (noise - s * (e[0] + 3.0 * (e[1] - e[0]))) / a
         images = model.codec.decode(clean).unflatten(0, (2, 6))
     for j, domain in enumerate(("color", "normal")):
-        torch.testing.assert_close(given[domain][0], images[j], atol=2e-3, rtol=2e-3)
+        torch.testing.assert_close(sampled[domain][0], images[j], atol=2e-3, rtol=2e-3)
 
 
 def test_color_and_normal_come_out_by_command(folder, gdtool, tmp_path):

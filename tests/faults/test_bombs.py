@@ -21,7 +21,7 @@ from gdtool.core import memory
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.core.folder import open_folder
 from gdtool.diffusion.data import archives
-from gdtool.diffusion.data.archives import object_count, views_of
+from gdtool.diffusion.data.archives import object_count, unpack_views
 from gdtool.folders.views import read_views
 from gdtool.images import io as image_io
 from gdtool.images.io import read_image, write_exr, write_png
@@ -289,7 +289,7 @@ def packed(path, members, mode="w", **how):
 
 def refused(archive, work, kind, fact):
     """Check that counting and unpacking both refuse an archive in one line, and that nothing is left in `work`."""
-    for use in (lambda: object_count(archive), lambda: list(views_of(archive, work))):
+    for use in (lambda: object_count(archive), lambda: list(unpack_views(archive, work))):
         with pytest.raises(kind, match=fact) as caught:
             use()
         assert caught.value.cure
@@ -325,14 +325,14 @@ def test_an_archive_of_too_many_members_is_refused(tmp_path, work, monkeypatch):
     monkeypatch.setattr(archives, "MAX_MEMBERS", 100)
     monkeypatch.setattr(archives, "MAX_OBJECT_MEMBERS", 20)
     with pytest.raises(ResourceError, match="20 files"):
-        list(views_of(tmp_path / "a.tar", work))
+        list(unpack_views(tmp_path / "a.tar", work))
 
 
 def test_an_object_of_too_many_bytes_is_refused_before_it_is_unpacked(tmp_path, work, monkeypatch):
     packed(tmp_path / "a.tar", [("a/views/color/0.png", bytes(1000)), ("a/views/color/1.png", bytes(1000))])
     monkeypatch.setattr(archives, "MAX_OBJECT_BYTES", 1500)
     with pytest.raises(ResourceError, match="unpack more than"):
-        list(views_of(tmp_path / "a.tar", work))
+        list(unpack_views(tmp_path / "a.tar", work))
     assert list(work.iterdir()) == []
 
 
@@ -384,5 +384,5 @@ def test_a_malformed_archive_is_refused_in_one_line(tmp_path, work, name):
     assert caught.value.cure
     assert "\n" not in str(caught.value)
     with contextlib.suppress(InputError):
-        assert list(views_of(tmp_path / "a.tar", work)) == []
+        assert list(unpack_views(tmp_path / "a.tar", work)) == []
     assert list(work.iterdir()) == []

@@ -14,7 +14,7 @@ from gdtool.diffusion.checkpoint import wonder3d
 from gdtool.diffusion.checkpoint.weights import load_model, read_config, save_model
 from gdtool.diffusion.config import PRESETS
 from gdtool.diffusion.inference.familiarity import read_ranges
-from gdtool.diffusion.network.grow import resized
+from gdtool.diffusion.network.grow import resize_config
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training.loop import CHECKPOINT, load_checkpoint
@@ -65,7 +65,7 @@ BAD_FIELDS = [
     ({"timesteps": 1}, r"`int` >= 2 - at `\$.timesteps`"),
     ({"sampling_steps": 0}, r"`int` >= 1 - at `\$.sampling_steps`"),
     ({"views": ["front", "top"]}, "views names 'top', which is none of"),
-    ({"views": ["front", "front"]}, "views names one twice"),
+    ({"views": ["front", "front"]}, "views names a value twice"),
     ({"views": []}, r"length >= 1 - at `\$.views`"),
     ({"domains": ["color", "smell"]}, "domains names 'smell'"),
     ({"domains": []}, r"length >= 1 - at `\$.domains`"),
@@ -125,7 +125,7 @@ def test_train_refuses_invalid_changes_to_its_configuration(tmp_path, changes):
 
 def test_an_image_size_that_the_network_cannot_have_is_refused():
     with pytest.raises(InputError, match="size: 8 does not fit the configuration: .*; give a multiple of 32"):
-        resized(msgspec.structs.replace(TINY, codec="vae", encoder="clip"), 8)
+        resize_config(msgspec.structs.replace(TINY, codec="vae", encoder="clip"), 8)
 
 
 def test_a_network_larger_than_the_memory_is_refused_with_the_prediction(folder):

@@ -11,7 +11,7 @@ from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
 from gdtool.core.folder import open_folder
 from gdtool.core.sources import digest
-from gdtool.diffusion.data.archives import object_count, views_of
+from gdtool.diffusion.data.archives import object_count, unpack_views
 from gdtool.folders.adapters import nerf, plain
 from gdtool.folders.views import read_views
 from gdtool.images.io import encode_png, write_png
@@ -245,7 +245,7 @@ def test_an_archive_writes_nothing_outside_the_workspace(tmp_path, name):
             member.size = len(content)
             tar.addfile(member, io.BytesIO(content))
     before = sorted(tmp_path.rglob("*"))
-    for use in (lambda: object_count(archive), lambda: list(views_of(archive, work))):
+    for use in (lambda: object_count(archive), lambda: list(unpack_views(archive, work))):
         with pytest.raises(InputError, match="a.tar"):
             use()
     assert sorted(tmp_path.rglob("*")) == before

@@ -1,4 +1,4 @@
-"""Closed-form shading against quadrature of the glTF and paper BRDFs, and its behaviour at the worst inputs."""
+"""Check closed-form shading against quadrature of both BRDFs, and its values and gradients at extreme inputs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ def light(axis: torch.Tensor, sharpness: float, amplitude: float = 1.0) -> Spher
 
 
 def quadrature(view, albedo, roughness, metallic, lights, kind="gltf", rings=240, spokes=160, around=None):
-    """Diffuse and specular of the true BRDF in float64; the grid is stratified about the given axis (the lobe's)."""
+    """Integrate the diffuse and the specular part of the exact BRDF over light directions, in float64.
+
+    around: axis of the polar grid, that of the sharpest lobe.
+    """
     dtype = torch.float64
     # cos θ from a power warp about the mirror direction, so that sharp lobes are resolved
     u = (torch.arange(rings, dtype=dtype) + 0.5) / rings
@@ -104,7 +107,7 @@ def test_specular_error_is_no_worse_than_measured(roughness, angle):
 @pytest.mark.parametrize("roughness", [0.0, 0.1, 0.3, 0.6, 1.0])
 @pytest.mark.parametrize("angle", [0.0, 45.0, 75.0])
 def test_furnace_of_the_specular_lobe(roughness, angle):
-    """Under uniform light of 1 a white metal reflects at most 1 (a little more where the lobe's fit errs)."""
+    """Under uniform light of 1 a white metal reflects at most 1, up to the error of the lobe's fit."""
     uniform = light(N, 0.0)
     _, got = shade_parts(N, direction(angle), torch.ones(3), torch.tensor(roughness), torch.tensor(1.0), uniform)
     assert 0.3 < float(got[0]) <= 1.06
@@ -115,7 +118,7 @@ def test_white_lambert_under_uniform_light_is_white():
     assert float(diffuse[0]) == pytest.approx(1.0, abs=2e-4)
 
 
-def test_linear_in_the_light_and_in_no_frame():
+def test_linear_in_the_light_and_independent_of_the_frame():
     generator = torch.Generator().manual_seed(0)
     axes = normalize(torch.randn(5, 3, generator=generator))
     lights = SphericalGaussians(
@@ -144,7 +147,7 @@ def test_linear_in_the_light_and_in_no_frame():
 
 
 @pytest.mark.parametrize("kind", ["gltf", "paper"])
-def test_finite_and_never_negative_at_every_adversary(kind):
+def test_finite_and_never_negative_at_extreme_inputs(kind):
     normals = torch.stack([N, torch.zeros(3), -N, direction(89.9999)])
     views = torch.stack([N, direction(90.0), direction(120.0), -N])
     axes = torch.stack([N, -N, direction(90.0), -direction(120.0)])
@@ -217,7 +220,7 @@ def test_visibility_and_fresnel_at_their_ends():
             )
             assert torch.isfinite(values).all()
             assert (values > 0).all()
-            # Both cosines 1: no masking at all leaves 1/4.
+            # At cosines of 1 there is no masking, which leaves 1/4.
             assert float(values[1]) == pytest.approx(0.25, rel=1e-6)
     f0 = torch.tensor([0.04, 0.5, 1.0])
     assert torch.equal(models.fresnel(f0, one * (1 + 1e-7)), f0)

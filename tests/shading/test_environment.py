@@ -1,4 +1,4 @@
-"""Environments: directions, sampling, the bundled lights and their fits by spherical Gaussians."""
+"""Check environments: directions, sampling, the bundled lights and their fits by spherical Gaussians."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.shading.lights.bundled import BUNDLED, direction, paint, random_lobes
+from gdtool.shading.lights.bundled import BUNDLED, direction, random_lobes, rasterise_lobes
 from gdtool.shading.lights.environment import METERED_WHITE, Environment
 from gdtool.shading.lights.load import load_environment
 from gdtool.shading.lights.prefilter import IrradianceMap
@@ -64,9 +64,9 @@ def test_bundled_lights_are_metered_and_fitted(name):
     assert abs(record["fit_error"]["energy"]) < 0.01
 
 
-def test_a_light_made_of_lobes_is_found_again():
+def test_a_light_made_of_lobes_is_fitted():
     axes = np.stack([direction(30, 40), direction(-100, 10)])
-    env = paint(axes, np.array([20.0, 4.0]), np.array([[3.0, 2, 1], [0.5, 0.5, 1]]), 32)
+    env = rasterise_lobes(axes, np.array([20.0, 4.0]), np.array([[3.0, 2, 1], [0.5, 0.5, 1]]), 32)
     lobes, error = fit_sg(env)
     assert error["radiance_rms"] < 0.1
     assert error["irradiance_rms"] < 0.02
@@ -74,16 +74,16 @@ def test_a_light_made_of_lobes_is_found_again():
 
 
 def test_random_studios_differ_and_repeat():
-    one, two = (random_lobes(np.random.default_rng(k)) for k in (1, 2))
-    assert not np.allclose(one[2], two[2])
-    assert all(np.array_equal(a, b) for a, b in zip(one, random_lobes(np.random.default_rng(1)), strict=True))
+    first, second = (random_lobes(np.random.default_rng(k)) for k in (1, 2))
+    assert not np.allclose(first[2], second[2])
+    assert all(np.array_equal(a, b) for a, b in zip(first, random_lobes(np.random.default_rng(1)), strict=True))
     for seed in range(20):
         _, lobes, record = studio(f"random:{seed}")
         assert (lobes.amplitudes >= 0).all()
         assert record["fit_error"]["irradiance_rms"] < 0.01
 
 
-def test_what_is_no_environment(tmp_path):
+def test_files_that_are_no_environment_are_refused(tmp_path):
     with pytest.raises(InputError, match="bundled lights"):
         load_environment(tmp_path / "none.hdr")
     from gdtool.images.io import write_exr, write_png
@@ -102,8 +102,8 @@ def test_what_is_no_environment(tmp_path):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 2), (3, 7), (8, 16), (64, 128), (300, 100)])
-def test_irradiance_does_not_depend_on_how_coarse_the_image_is(size):
-    """White all around gives π, and light from above π (1 + n·y) / 2, in the table and by the sum."""
+def test_irradiance_does_not_depend_on_the_images_resolution(size):
+    """Uniform light of 1 gives π, and light from above π (1 + n·y) / 2, by the table and by the sum."""
     normals = np.random.default_rng(0).normal(size=(200, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     image = np.ones((*size, 3), np.float32)

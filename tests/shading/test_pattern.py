@@ -1,4 +1,4 @@
-"""The places of a pixel's samples, and what a mean over them is known to."""
+"""Check where the samples of a pixel lie, and the error of a mean over them."""
 
 import numpy as np
 import pytest
@@ -8,12 +8,12 @@ from gdtool.shading.render.render import ERROR_POWER, ERROR_SCALE
 
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])
-def test_every_pass_is_even_and_centred(count):
+def test_every_pass_is_evenly_spread_and_centred(count):
     points = pixel_pattern(count)
     assert points.min() >= 0
     assert points.max() < 1
     assert np.abs(points.mean(0) - 0.5).max() < 1e-6
-    # Sobol's points lie one in each column and each row as many as there are; centring moves them by up to another.
+    # There is one Sobol point in each of `count` columns and rows; centring moves it by up to another cell.
     for axis in (0, 1):
         ranks = np.sort(points[:, axis])
         assert np.abs(ranks - (np.arange(count) + 0.5) / count).max() < 1.6 / count
@@ -21,7 +21,7 @@ def test_every_pass_is_even_and_centred(count):
 
 @pytest.mark.parametrize("count", [4, 8, 16, 32, 64])
 def test_the_expected_error_is_that_of_straight_edges(count):
-    """Root mean square over edges at every angle and place, within a third: what render.py stops sampling by."""
+    """Compare the error model that stops sampling with the RMS over edges of every angle and place, within a third."""
     random = np.random.default_rng(0)
     angle, offset = random.uniform(0, 2 * np.pi, 20_000), random.uniform(-0.7, 0.7, 20_000)
     normal = np.stack([np.cos(angle), np.sin(angle)])

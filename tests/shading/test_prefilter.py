@@ -1,4 +1,4 @@
-"""Light averaged in advance against sums over all of it, and the skips that must not change a picture."""
+"""Check prefiltered light against sums over the whole light, and pictures rendered with it."""
 
 from __future__ import annotations
 
@@ -41,26 +41,26 @@ def test_pyramid_keeps_the_mean():
     canvas = Environment(np.zeros((64, 128, 3)))
     smooth = LightPyramid(Environment((canvas.directions + 1).astype(np.float32)))
     d = octahedral_directions(16)
-    found = smooth.mean(
+    result = smooth.mean(
         *(torch.tensor(c, dtype=torch.float32)[None] for c in d.T), torch.full((1, 1), smooth.texel_angle * 1.01)
     )[:, 0].T
-    assert np.abs(found.numpy() - 1 - d).mean() < 0.05
+    assert np.abs(result.numpy() - 1 - d).mean() < 0.05
 
 
-# The sharp one is drawn by samples that overlap, which widens it: measured 7 %.
+# The sharpest lobe is sampled with overlap, which widens it: measured 7 %.
 @pytest.mark.parametrize(
     "roughness, side, dense, tolerance",
     [(0.2, 128, 0, 0.08), (0.3, 64, 64, 0.06), (0.5, 32, 32, 0.06), (1.0, 32, 32, 0.06)],
 )
 def test_filtered_light_is_the_lobes_average(roughness, side, dense, tolerance):
-    env = studio("mid", fit=False)[0].shrunk(64)
+    env = studio("mid", fit=False)[0].downsampled(64)
     light = (env.image * env.solid_angles[:, None, None]).reshape(-1, 3)
     toward, weight = env.directions.reshape(-1, 3), np.repeat(env.solid_angles, env.image.shape[1])
     normal = octahedral_directions(8)
     cosine, a2 = normal @ toward.T, roughness**4
     lobe = np.maximum(cosine, 0) / (0.5 * (1 + a2) - 0.5 * (1 - a2) * cosine) ** 2
     truth = lobe @ light / (lobe @ weight)[:, None]
-    found = (
+    result = (
         read_octahedral(
             filtered_light(LightPyramid(env), roughness, side, dense),
             *(torch.tensor(c, dtype=torch.float32) for c in normal.T),
@@ -68,7 +68,7 @@ def test_filtered_light_is_the_lobes_average(roughness, side, dense, tolerance):
         .numpy()
         .T
     )
-    assert np.abs(found - truth).mean() < tolerance * truth.mean()
+    assert np.abs(result - truth).mean() < tolerance * truth.mean()
 
 
 def test_only_needed_levels_are_made_and_white_stays_white():
@@ -83,7 +83,7 @@ def test_only_needed_levels_are_made_and_white_stays_white():
 
 @pytest.mark.parametrize("light", ["mid", "bright"])
 def test_prefiltered_is_near_the_converged_picture(light):
-    """30 dB and more, inside the outline, for what is not a metal."""
+    """At least 30 dB inside the outline, for a dielectric."""
     env, camera = studio(light, fit=False)[0], rig("six", 48)[1]
     pictures = []
     for samples, mode in ((64, "sampled"), (2, "prefiltered")):
@@ -95,7 +95,7 @@ def test_prefiltered_is_near_the_converged_picture(light):
 
 
 def test_estimated_error_is_about_the_true_one():
-    """The estimate that --target-psnr trusts: what it says was reached is, to 3 dB, against a converged picture."""
+    """A PSNR that was estimated as reached is true to 3 dB, compared with a converged picture (for --target-psnr)."""
     env, camera = studio("mid", fit=False)[0], rig("six", 32)[1]
     material = sphere(material=GREY)
     best = Renderer(material)

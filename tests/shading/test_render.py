@@ -1,4 +1,4 @@
-"""Rendered buffers and direct light of shapes with analytic answers."""
+"""Check rendered buffers and direct light on shapes with analytic answers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sphere(radius: float = 0.5, rings: int = 96, material: Material = GREY) -> S
 
 
 def quad(material: Material, z: float = 0.0, half: float = 0.5, uv_scale: float = 1.0) -> Scene:
-    """A square that faces +Z, its texture upright as seen from there."""
+    """Make a square that faces +Z, with its texture upright as seen from there."""
     vertices = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]])
     uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], float) * uv_scale
     return Scene(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32), materials=(material,), uvs=(uv,))
@@ -82,8 +82,11 @@ def test_coverage_of_a_quad_that_cuts_pixels():
     assert not row[43:].any()
 
 
-def test_every_pass_of_a_pixels_samples_tells_something_new():
-    """Coverage by half planes: the error falls faster than the root of their number, and no sample lies on another."""
+def test_every_pass_of_a_pixels_samples_reduces_the_error():
+    """The error of coverage by half planes falls faster than the root of the number of samples.
+
+    No two samples coincide.
+    """
     rng = np.random.default_rng(0)
     angle, offset = rng.random(400) * 2 * np.pi, rng.uniform(-0.5, 0.5, 400)
     grid = np.stack(np.meshgrid(*[(np.arange(200) + 0.5) / 200] * 2), -1).reshape(-1, 2)
@@ -102,23 +105,23 @@ def test_every_pass_of_a_pixels_samples_tells_something_new():
 
 
 def four_colors() -> Texture:
-    """Red top left, green top right, blue bottom left, white bottom right; sRGB 8 bit."""
+    """Make an 8-bit sRGB texture: red top left, green top right, blue bottom left, white bottom right."""
     image = np.zeros((2, 2, 3), np.uint8)
     image[0, 0], image[0, 1], image[1, 0], image[1, 1] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
     return Texture(image, "srgb", filter="nearest")
 
 
 def test_pictures_are_not_mirrored_in_any_view():
-    """An asymmetric object: a red ball toward +X, a green one on top, a blue one in front."""
+    """The object has a red ball toward +X, a green one on top and a blue one in front."""
     balls = [(0.35, 0, 0), (0, 0.35, 0), (0, 0, 0.35)]
-    one = sphere(0.1, 16)
-    parts = [one.vertices + np.array(p) for p in balls]
-    colors = np.repeat(np.eye(3), len(one.vertices), 0)
+    ball = sphere(0.1, 16)
+    parts = [ball.vertices + np.array(p) for p in balls]
+    colors = np.repeat(np.eye(3), len(ball.vertices), 0)
     scene = Scene(
         vertices=np.concatenate(parts),
-        faces=np.concatenate([one.faces + k * len(one.vertices) for k in range(3)]),
+        faces=np.concatenate([ball.faces + k * len(ball.vertices) for k in range(3)]),
         materials=(dataclasses.replace(GREY, base_color=(1, 1, 1, 1)),),
-        normals=np.concatenate([one.normals] * 3),
+        normals=np.concatenate([ball.normals] * 3),
         colors=np.concatenate([colors, np.ones((len(colors), 1))], 1),
     )
     expected = {"front": "right", "back": "left", "right": None, "left": None}
@@ -168,7 +171,7 @@ def test_a_fine_checker_averages_and_second_uv_set_is_used():
 
 
 def test_normal_map_tilts_toward_the_tangents():
-    """+X in the map is toward +u, +Y (green) up in the picture; both from the front and from behind."""
+    """+X of the map tilts toward +u and +Y (green) toward the top of the picture, from the front and from behind."""
     tilted = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.6, 0.8])
     for local in tilted:
         texel = np.rint((0.5 * local + 0.5) * 65535).astype(np.uint16)
@@ -206,14 +209,14 @@ def test_alpha_mask_lets_rays_through_and_blend_counts_from_one_half():
 
 
 def test_white_furnace_of_sampled_light():
-    """A white rough dielectric under uniform light of 1 reflects about 1: neither shadows nor sampling lose energy."""
+    """Under uniform light of 1 a white rough dielectric reflects about 1: neither shadows nor sampling lose energy."""
     white = Material(base_color=(1, 1, 1, 1), metallic=0.0, roughness=1.0)
     color, mask = render_color(sphere(material=white), rig("six", 48)[0], uniform(), samples=4, light_samples=64)
     assert color[mask == 1].mean() == pytest.approx(0.985, abs=0.03)
 
 
 def test_lambert_quad_under_a_hemisphere_and_its_shadow():
-    """Under light from above the horizon only, a plain facing it gets albedo; a roof over it takes the light away."""
+    """A square under uniform light reflects its albedo, and a wall beside it hides the analytic share of the light."""
     from gdtool.shading.bsdf.brdf import MIN_ROUGHNESS
 
     floor = quad(dataclasses.replace(GREY, base_color=(0.5, 0.5, 0.5, 1), roughness=1.0))
@@ -241,29 +244,29 @@ def test_lambert_quad_under_a_hemisphere_and_its_shadow():
 def test_same_seed_same_pixels_and_noise_falls_with_samples():
     light = Environment(np.random.default_rng(0).random((16, 32, 3)).astype(np.float32) ** 4)
     scene, camera = sphere(), rig("six", 32)[0]
-    one, mask = render_color(scene, camera, light, samples=4, light_samples=4, seed=3)
-    two, _ = render_color(scene, camera, light, samples=4, light_samples=4, seed=3)
-    assert np.array_equal(one, two)
+    first, mask = render_color(scene, camera, light, samples=4, light_samples=4, seed=3)
+    again, _ = render_color(scene, camera, light, samples=4, light_samples=4, seed=3)
+    assert np.array_equal(first, again)
     best, _ = render_color(scene, camera, light, samples=4, light_samples=256, seed=9)
     more, _ = render_color(scene, camera, light, samples=4, light_samples=64, seed=4)
 
     def error(image):
         return np.sqrt(((image - best)[mask == 1] ** 2).mean())
 
-    assert error(more) < 0.4 * error(one)
-    assert (one >= 0).all()
-    assert np.isfinite(one).all()
+    assert error(more) < 0.4 * error(first)
+    assert (first >= 0).all()
+    assert np.isfinite(first).all()
 
 
 def test_light_is_unbiased_at_few_directions():
-    """The mean of many cheap renderings is the expensive one, in the open, in half shadow and on refined pixels."""
+    """The mean of many noisy renderings is the converged one: in the open, in half shadow and on refined pixels."""
     light = Environment((np.random.default_rng(5).random((16, 32, 3)) ** 8).astype(np.float32) * 5)
-    one = sphere(0.25, 24)
+    ball = sphere(0.25, 24)
     scene = Scene(
-        vertices=np.concatenate([one.vertices + (0.2, 0, 0.1), one.vertices - (0.2, 0, 0.1)]),
-        materials=one.materials,
-        faces=np.concatenate([one.faces, one.faces + len(one.vertices)]),
-        normals=np.concatenate([one.normals] * 2),
+        vertices=np.concatenate([ball.vertices + (0.2, 0, 0.1), ball.vertices - (0.2, 0, 0.1)]),
+        materials=ball.materials,
+        faces=np.concatenate([ball.faces, ball.faces + len(ball.vertices)]),
+        normals=np.concatenate([ball.normals] * 2),
     )
     camera = rig("six", 24)[1]
     best, mask = render_color(scene, camera, light, samples=16, light_samples=256, seed=50)

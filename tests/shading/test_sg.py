@@ -1,4 +1,4 @@
-"""Spherical Gaussians against mpmath and float64 quadrature, over sweeps of sharpness and angle (the fast half)."""
+"""Check spherical Gaussians against mpmath and float64 quadrature, over sweeps of sharpness and angle."""
 
 from __future__ import annotations
 
@@ -68,7 +68,10 @@ def test_product_against_mpmath(gap):
 
 
 def cosine_by_quadrature(sharpness: float, cosine: float, clamped: bool) -> float:
-    """∫ exp(λ(cos θ − 1)) max(0, v·n) (or the hemisphere's indicator) in polar coordinates about the axis, float64."""
+    """Integrate exp(λ(cos θ − 1)) max(0, v·n) in polar coordinates about the axis, in float64.
+
+    clamped: whether the factor is the clamped cosine; otherwise it is the indicator of the hemisphere.
+    """
     z, w = NODES, WEIGHTS
     # x = λ (1 − cos θ) cut where the lobe has vanished
     reach = min(2.0, 60.0 / max(sharpness, 1e-9))

@@ -1,5 +1,4 @@
-"""Every skip of the renderer on and off: what is left out changes nothing, or no more than the tolerance stated
-here."""
+"""Check each kind of work that the renderer skips, by rendering with and without it, to the tolerance of each test."""
 
 from __future__ import annotations
 
@@ -26,7 +25,7 @@ from tests.shading.test_render import GREY, four_colors, quad, sphere
 
 
 @pytest.mark.parametrize("most", [0, 10**18], ids=["by the hull", "by pairs"])
-def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
+def test_a_mesh_is_convex_if_its_vertices_lie_on_its_hull(most, monkeypatch):
     monkeypatch.setattr(rays, "_MAX_PAIRS", most)
     ball = sphere(rings=24)
     turned = ball.vertices @ np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
@@ -45,7 +44,7 @@ def test_convex_is_what_lies_on_its_hull(most, monkeypatch):
 
 
 def test_convex_objects_need_no_shadow_rays(monkeypatch):
-    # Without chance, whose dice fall only where rays may be cast.
+    # Without Russian roulette, which applies only where rays may be cast.
     monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     vertices, faces = cube()
     ball = sphere(rings=12)
@@ -64,7 +63,7 @@ def test_convex_objects_need_no_shadow_rays(monkeypatch):
     assert np.array_equal(*pictures)
 
 
-def test_pixels_outside_the_bounds_hold_nothing():
+def test_pixels_outside_the_bounds_are_empty():
     camera, renderer = rig("six", 48)[0], Renderer(sphere(0.2, 24))
     few = renderer.buffers(camera, 8)
     assert renderer.counts.pixels_in_bounds < 0.3 * renderer.counts.pixels
@@ -73,8 +72,8 @@ def test_pixels_outside_the_bounds_hold_nothing():
     assert all(np.array_equal(few[name], everything[name]) for name in few)
 
 
-def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
-    """Adaptive sampling against all samples everywhere."""
+def test_skipping_samples_of_uniform_pixels_changes_little(monkeypatch):
+    """Compare adaptive sampling with all samples everywhere."""
     material = dataclasses.replace(GREY, base_color=(1, 1, 1, 1), base_color_texture=four_colors())
     scene, camera = quad(material), rig("six", 64)[1]
     renderer = Renderer(scene)
@@ -88,7 +87,7 @@ def test_skipping_even_pixels_changes_nothing_that_counts(monkeypatch):
 
 
 def test_a_texture_of_one_value_is_a_factor():
-    """Not looked up, and the picture is the same to the bit; the manifest's skip names it."""
+    """The texture is not read, the picture is the same to the bit, and the skipped work names the texture."""
     from gdtool.shading.render.skipped_work import skipped_work
 
     flat = Texture(np.full((8, 8, 3), (200, 100, 50), np.uint8), "srgb")
@@ -100,13 +99,13 @@ def test_a_texture_of_one_value_is_a_factor():
     renderers[1].lookup.skip_constant = False
     few, all_ = (renderer.buffers(rig("six", 48)[1], 8) for renderer in renderers)
     assert all(np.array_equal(few[name], all_[name]) for name in few)
-    told = {what: why for what, why, _ in skipped_work(renderers[0], 8, None)}
-    assert "one value" in told["base color lookups"]
-    assert "metallic-roughness lookups" not in told
+    reasons = {what: why for what, why, _ in skipped_work(renderers[0], 8, None)}
+    assert "one value" in reasons["base color lookups"]
+    assert "metallic-roughness lookups" not in reasons
 
 
 def two_balls() -> Scene:
-    """A large ball that shades a small one, so that shadow rays have something to find."""
+    """Make a large ball that shades a small one, so that shadow rays hit something."""
     large, small = sphere(0.3, 24), sphere(0.15, 16)
     vertices = np.concatenate([large.vertices, small.vertices + (0.28, 0.25, 0.2)])
     faces = np.concatenate([large.faces, small.faces + len(large.vertices)])
@@ -116,8 +115,10 @@ def two_balls() -> Scene:
 
 
 def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
-    """Russian roulette: over many seeds the same picture (to 0.5 % in the mean, 3 % at a pixel), with fewer rays and
-    hardly more noise."""
+    """Russian roulette needs fewer rays for the same mean over many seeds, to 0.5 % in all and 3 % at a pixel.
+
+    The noise grows by less than a tenth.
+    """
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
     means, noises, rays = [], [], []
     for share in (0.0, direct.ROULETTE_SHARE):
@@ -137,9 +138,8 @@ def test_leaving_out_rays_toward_little_light_keeps_the_mean(monkeypatch):
     assert noises[1] < 1.1 * noises[0]
 
 
-def test_directions_below_the_horizon_bring_nothing(monkeypatch):
-    """Followed all the same, they meet the surface that they start from, but for a few that leave over an edge (1 in
-    1000)."""
+def test_directions_below_the_horizon_contribute_nothing(monkeypatch):
+    """Rays in these directions hit the surface that they start from, but for 1 in 1000 that pass over an edge."""
     monkeypatch.setattr(direct, "ROULETTE_SHARE", 0.0)
     scene, camera, light = two_balls(), rig("six", 24)[1], studio("mid", fit=False)[0]
     evaluate, frames, rays = PointReflection.evaluate, [], []
@@ -157,10 +157,10 @@ def test_directions_below_the_horizon_bring_nothing(monkeypatch):
     assert np.abs(frames[0] - frames[1]).mean() < 1e-3 * frames[0].mean()
 
 
-def test_absent_textures_are_as_white_ones():
+def test_absent_textures_equal_white_ones():
     white = Texture(np.full((4, 4, 3), 255, np.uint8), "linear")
     flat = Texture(np.tile(np.array([128, 128, 255], np.uint8), (4, 4, 1)), "linear")
-    given = dataclasses.replace(
+    textured = dataclasses.replace(
         GREY,
         base_color_texture=dataclasses.replace(white, encoding="srgb"),
         metallic_roughness_texture=white,
@@ -168,7 +168,7 @@ def test_absent_textures_are_as_white_ones():
         emissive_texture=dataclasses.replace(white, encoding="srgb"),
     )
     frames = []
-    for material in (GREY, given):
+    for material in (GREY, textured):
         renderer = Renderer(quad(material))
         renderer.lookup.skip_constant = False
         frames.append(renderer.buffers(rig("six", 32)[1], 8))
@@ -179,7 +179,7 @@ def test_absent_textures_are_as_white_ones():
 
 
 def test_opaque_materials_need_no_alpha_test():
-    """Alpha in the texture of an opaque material means nothing; tested at a cutoff of 0 it changes nothing."""
+    """The alpha of an opaque material's texture has no effect, and an alpha test at a cutoff of 0 changes nothing."""
     texels = np.full((8, 8, 4), 255, np.uint8)
     texels[::2, :, 3] = 0
     opaque = dataclasses.replace(GREY, base_color_texture=Texture(texels, "srgb"))
@@ -191,7 +191,7 @@ def test_opaque_materials_need_no_alpha_test():
     assert all(np.array_equal(frames[0][name], frames[1][name]) for name in frames[0])
 
 
-def test_prefiltered_levels_that_nothing_needs_are_not_missed():
+def test_prefiltering_unneeded_levels_changes_nothing():
     camera, light, frames = rig("six", 32)[1], studio("mid", fit=False)[0], []
     for everything in (False, True):
         renderer = Renderer(sphere(rings=24))

@@ -8,6 +8,10 @@ from gdtool.diffusion.network.tensors import pretrained_part, read_tensors
 
 
 def start_from_pretrained(model: Model) -> list[str]:
-    """Load the UNet of config.pretrained, a local folder or hub id; returns the names of the new parts."""
+    """Load the UNet weights of config.pretrained, a local folder or a hub id, into the model.
+
+    Returns the names of the parameters that Stable Diffusion lacks; they keep their initial values. Raises InputError
+    and ResourceError as pretrained_part() and load_stable_diffusion() do.
+    """
     tensors, _ = read_tensors(pretrained_part(model.config, "unet") / "diffusion_pytorch_model.safetensors")
     return load_stable_diffusion(model.unet, tensors)

@@ -22,8 +22,11 @@ OTHER_START = (
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
-    """Raise InputError that names the first tensor that is missing, unknown, of another shape or not of floating-point
-    numbers."""
+    """Compare the tensors of a file with the parameters of a network, by name.
+
+    path: the file that errors name. wanted: the network's state_dict, on any device. Raises InputError for the first
+    tensor that is missing, unknown, of another shape or not of a floating-point type.
+    """
     for name, tensor in wanted.items():
         if name not in tensors:
             raise InputError(path, f"lacks tensor {name}", OTHER_WEIGHTS)
@@ -48,11 +51,14 @@ def read_config(path: Path) -> ModelConfig:
     """Read a model folder's config.json. Raises InputError that names the wrong field and its bound."""
     if not path.exists():
         raise InputError(path, "does not exist", NO_MODEL)
-    return configured(read_json(path), path)
+    return parse_config(read_json(path), path)
 
 
-def configured(fields: object, subject: object) -> ModelConfig:
-    """Convert parsed JSON to a ModelConfig. Raises InputError that names subject, the field and its bound."""
+def parse_config(fields: object, subject: object) -> ModelConfig:
+    """Convert parsed JSON to a ModelConfig.
+
+    subject: the file or folder that an error names. Raises InputError that names the wrong field and its bound.
+    """
     try:
         return msgspec.convert(fields, ModelConfig)
     except msgspec.ValidationError as error:
@@ -61,10 +67,11 @@ def configured(fields: object, subject: object) -> ModelConfig:
         ) from None
 
 
-def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
-    """Build the network's structure without numbers. Raises ResourceError where its weights would not fit in memory.
+def require_model_fits(config: ModelConfig, bytes_per_weight: int, subject: object) -> Model:
+    """Build the network on PyTorch's meta device, which holds shapes and no values, and check that its weights fit.
 
-    bytes_per_weight: bytes held for each weight, for example BYTES_TO_LOAD.
+    bytes_per_weight: bytes of memory held for each weight, for example BYTES_TO_LOAD. subject: the file or folder that
+    an error names. Raises ResourceError where the weights would not fit in memory.
     """
     shape = structure(config)
     weights = parameter_count(shape)
@@ -75,11 +82,11 @@ def require_room(config: ModelConfig, bytes_per_weight: int, subject: object) ->
 def load_model(folder: Path) -> Model:
     """Load the Model of a folder, in evaluation mode, float32.
 
-    Raises InputError for damaged or mismatched files, ResourceError where it does not fit in memory. Nothing of the
-    size of its weights is allocated before the configuration and the weights are known to fit one another.
+    Raises InputError for damaged or mismatched files, and ResourceError where the model does not fit in memory. Memory
+    for the weights is allocated only after the configuration and the file have been checked against each other.
     """
     config = read_config(folder / "config.json")
-    wanted = require_room(config, BYTES_TO_LOAD, folder).state_dict()
+    wanted = require_model_fits(config, BYTES_TO_LOAD, folder).state_dict()
     tensors, _ = read_tensors(folder / WEIGHTS)
     check_shapes(folder / WEIGHTS, tensors, wanted)
     model = Model(config)
@@ -88,7 +95,10 @@ def load_model(folder: Path) -> Model:
 
 
 def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -> None:
-    """Write config.json and model.safetensors in half precision; path_of maps a name to where it is written."""
+    """Write config.json and model.safetensors, the weights in float16.
+
+    path_of: function from a file's name to the path that it is written to. tensors: the model's weights by name.
+    """
     from safetensors.torch import save
 
     Path(path_of("config.json")).write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=1) + b"\n")
@@ -97,15 +107,16 @@ def save_model(path_of, config: ModelConfig, tensors: dict[str, torch.Tensor]) -
 
 
 def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
-    """Start a UNet from Stable Diffusion's weights (diffusers names); returns the names that keep their initial values.
+    """Copy Stable Diffusion's weights, named as in diffusers, into a UNet.
 
-    conv_in grows by the condition's channels and class labels by the domains, both with zeros. Raises InputError for a
-    tensor that is not known here or has another shape.
+    The UNet's conv_in has more input channels (for the condition), and its class embedding more inputs (for the
+    domains). The added columns are zero. Returns the names of the parameters that keep their initial values. Raises
+    InputError for a tensor that the UNet lacks or that has another shape.
     """
     state = unet.state_dict()
     for name, tensor in tensors.items():
         if name not in state:
-            raise InputError("pretrained weights", f"hold a tensor {name} that this network has not", OTHER_START)
+            raise InputError("pretrained weights", f"hold a tensor {name} that this network lacks", OTHER_START)
         target = state[name]
         if name in ("conv_in.weight", "class_embedding.linear_1.weight") and tensor.shape[1] <= target.shape[1]:
             grown = torch.zeros_like(target)
@@ -114,7 +125,7 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
         if tensor.shape != target.shape:
             raise InputError(
                 "pretrained weights",
-                f"tensor {name} has shape {tuple(tensor.shape)}, needed is {tuple(target.shape)}",
+                f"tensor {name} has shape {tuple(tensor.shape)}, the network needs {tuple(target.shape)}",
                 OTHER_START,
             )
         state[name] = tensor

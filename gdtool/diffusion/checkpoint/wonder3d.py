@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from gdtool.core.errors import InputError
 from gdtool.core.reading import read_json
-from gdtool.diffusion.checkpoint.weights import BYTES_TO_LOAD, check_shapes, configured, require_room
+from gdtool.diffusion.checkpoint.weights import BYTES_TO_LOAD, check_shapes, parse_config, require_model_fits
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 from gdtool.diffusion.network.model import Model
@@ -26,7 +26,7 @@ from gdtool.diffusion.network.tensors import read_tensors
 EXTENT = 192 / 256
 UNET = "unet/diffusion_pytorch_model.safetensors"
 NEAREST_NORMAL = 3**0.5 - 1  # from white (1, 1, 1), encoded, to the nearest unit normal
-LEGACY = (
+OLDER_KEYS = (
     (".attn_joint_twice.", ".attn_joint_mid."),
     (".norm_joint_twice.", ".norm_joint_mid."),
     (".attn_joint.", ".attn_joint_last."),
@@ -61,19 +61,23 @@ class _Scheduler(msgspec.Struct):
 
 
 def recognises(folder: Path) -> bool:
-    """Tell whether a folder has the layout of a diffusers pipeline."""
+    """Check whether a folder has the layout of a diffusers pipeline."""
     return (folder / "unet" / "config.json").is_file()
 
 
-def renamed(name: str) -> str:
-    """Translate a key of the published weights, older spellings included, to this network's."""
-    for old, new in LEGACY:
+def translate_key(name: str) -> str:
+    """Translate a key of the published weights, in the older spelling or the newer one, to a key of this network."""
+    for old, new in OLDER_KEYS:
         name = name.replace(old, new)
     return name
 
 
 def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
-    """Derive the configuration from unet/config.json and scheduler/. Raises InputError for another structure."""
+    """Derive the configuration from unet/config.json and scheduler/scheduler_config.json.
+
+    tensors: the UNet's weights by name; they show where in a block the attention across domains stands. Raises
+    InputError for a structure other than Wonder3D's.
+    """
     path = folder / "unet" / "config.json"
     unet = _read(path, _UNet)
     scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
@@ -88,8 +92,8 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
         if value != wanted:
             raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
     if not isinstance(unet.attention_head_dim, int):
-        raise InputError(path, "has another number of heads at each level", OTHER_FOLDER)
-    return configured(
+        raise InputError(path, "has a different number of heads at each level, and Wonder3D the same", OTHER_FOLDER)
+    return parse_config(
         {
             "image_size": 8 * unet.sample_size,
             "domains": ("color", "normal"),
@@ -120,14 +124,15 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
 
 
 def load(folder: Path):
-    """Load a published folder as a Model, in evaluation mode, float32. Raises InputError for a missing or unused
-    tensor.
+    """Load a published folder as a Model, in evaluation mode, float32.
+
+    Raises InputError for a missing or unused tensor.
     """
     if _read(folder / "unet" / "config.json", _UNet).in_channels == 4:
         raise InputError(
             folder,
-            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training starts from it, "
-            "it has no views",
+            "is a Stable Diffusion that makes single pictures, such as Image Variations: a training can start from it, "
+            "but it samples no views",
             "give a model folder of gdtool train, or Wonder3D's; gdtool train --preset paper trains one from it",
         )
     if not (folder / UNET).is_file() and not list((folder / "unet").glob("*.bin")):
@@ -139,11 +144,11 @@ def load(folder: Path):
         )
     tensors, _ = read_tensors(folder / UNET)
     for part, name in (("vae", "diffusion_pytorch_model"), ("image_encoder", "model")):
-        # A pickle or a damaged file is named before a library opens it.
+        # Raise an error for a pickle or a damaged file before a library opens it.
         read_tensors(folder / part / f"{name}.safetensors")
-    tensors = {renamed(name): tensor.float() for name, tensor in tensors.items()}
+    tensors = {translate_key(name): tensor.float() for name, tensor in tensors.items()}
     config = read_config(folder, tensors)
-    check_shapes(folder / UNET, tensors, require_room(config, BYTES_TO_LOAD, folder).unet.state_dict())
+    check_shapes(folder / UNET, tensors, require_model_fits(config, BYTES_TO_LOAD, folder).unet.state_dict())
     model = Model(config)
     model.unet.load_state_dict(tensors)
     return model.eval().requires_grad_(False)
@@ -152,8 +157,8 @@ def load(folder: Path):
 def premultiplied_normals(x: torch.Tensor) -> torch.Tensor:
     """Convert normals (…, 3, h, w) in [-1, 1] over white to normals times coverage, the encoding of gdtool's models.
 
-    Coverage m leaves m |n - 1| of the distance to white, at least 0.73 m for a unit normal n: a value nearer to white
-    is an edge.
+    A pixel of coverage m and unit normal n lies m |n - 1| from white (1, 1, 1), which is at least 0.73 m. So a pixel
+    nearer to white than 0.73 is partly covered, and its distance over 0.73 estimates m.
     """
     m = ((x - 1).norm(dim=-3, keepdim=True) / NEAREST_NORMAL).clamp(0, 1)
     n = (x - (1 - m)) / m.clamp_min(1e-3)
@@ -164,7 +169,7 @@ _Typed = TypeVar("_Typed")
 
 
 def _read(path: Path, kind: type[_Typed]) -> _Typed:
-    """Read a JSON file of a type. Raises InputError that names the field where it does not fit."""
+    """Read a JSON file into the msgspec struct `kind`. Raises InputError that names the field that does not fit."""
     if not path.exists():
         raise InputError(path, "does not exist", "copy the whole folder")
     try:

@@ -1,8 +1,8 @@
 """Read views folders from .tar files, one object at a time: training data that travels as a few large files.
 
-Two namings are read. Plain is what `tar cf shard-0.tar cat.asset/views dog.asset/views` makes. In WebDataset's, the
-files of an object share a key and stand together: KEY.manifest.json, KEY.color.front.png for color/front.png, and so
-on.
+Members may be named in two ways. Plain names are those that `tar cf shard-0.tar cat.asset/views dog.asset/views`
+writes. In WebDataset's naming the files of an object share a key and follow each other: KEY.manifest.json,
+KEY.color.front.png for color/front.png, and so on.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ MAX_OBJECT_BYTES = 16 << 30  # unpacked, of one views folder: what lies on the d
 # Of a compressed archive, unpacked over packed: PNG and EXR are packed already, and padding with zeros gives some 20
 # for the smallest pictures.
 MAX_RATIO = 200
-MIN_JUDGED_BYTES = 64 << 20  # unpacked; below it a ratio says nothing and harms nothing
+MIN_JUDGED_BYTES = 64 << 20  # unpacked; smaller archives may have any ratio
 MAX_HEADER_BYTES = 1 << 20  # of an extended header (long names, PAX records), which is read whole
 
 _PACK = "pack it again with tar, plain or compressed"
@@ -44,13 +44,13 @@ _EXTENDED = (
 _BLOCK = 1 << 20  # bytes copied at a time
 
 
-def placed(member: str) -> tuple[str, str]:
-    """Split a member's name into its object and its path inside the object's views folder."""
+def split_member_name(member: str) -> tuple[str, str]:
+    """Split a member's name into the name of its object and the path inside that object's views folder."""
     path = PurePosixPath(member)
     key, _, extension = path.name.partition(".")
     if "." in extension:  # WebDataset: KEY.manifest.json, KEY.color.front.png
         return str(path.with_name(key)), "/".join(extension.split(".")[:-1]) + path.suffix
-    # plain: pictures lie one folder deeper than the manifest, whose neighbours are known
+    # plain: pictures are one folder deeper than the manifest, except for the contact sheet
     root = path.parent if path.suffix not in (".png", ".exr") or path.stem == "contact_sheet" else path.parent.parent
     return str(root), str(path.relative_to(root))
 
@@ -58,31 +58,33 @@ def placed(member: str) -> tuple[str, str]:
 def object_count(archive: Path) -> int:
     """Count the views folders in a .tar by reading its headers.
 
-    Raises InputError unless it is a whole tar of regular files with names that stay inside, ResourceError for more
-    members or bytes than the limits above.
+    Raises InputError unless it is a whole tar whose names stay inside the folder that it is unpacked to. Raises
+    ResourceError for more than MAX_MEMBERS members, or for an archive that would unpack to more than MAX_RATIO times
+    its size.
     """
-    with _opened_tar(archive) as tar:
-        count = sum(placed(member.name)[1] == MANIFEST for member in _members(archive, tar))
+    with _open_tar(archive) as tar:
+        count = sum(split_member_name(member.name)[1] == MANIFEST for member in _members(archive, tar))
     if not count:
         raise InputError(archive, "holds no views folder", "pack what render-dataset writes")
     return count
 
 
-def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
-    """Unpack the views folders of a .tar one after another under workspace, removing each again.
+def unpack_views(archive: Path, workspace: Path) -> Iterator[Folder]:
+    """Unpack the views folders of a .tar under workspace, one after another; each is removed before the next.
 
-    An object's members must stand together, as tar and WebDataset write them. Each header is checked before its content
-    is unpacked. Raises InputError and ResourceError as object_count(), OutputError where workspace cannot be written.
+    An object's members must follow each other, as tar and WebDataset write them. Each header is checked before its
+    content is unpacked. Raises InputError and ResourceError as object_count(), and OutputError where workspace cannot
+    be written.
     """
     root = Path(tempfile.mkdtemp(dir=workspace, prefix="unpacked-"))
     try:
-        with _opened_tar(archive) as tar:
+        with _open_tar(archive) as tar:
             current = None
             for member in _members(archive, tar):
-                name, relative = placed(member.name)
+                name, relative = split_member_name(member.name)
                 if name != current:
                     if current is not None:
-                        yield _opened(archive, root, current)
+                        yield _open_object(archive, root, current)
                     shutil.rmtree(root)
                     root.mkdir()
                     current, count, size = name, 0, 0
@@ -94,23 +96,25 @@ def views_of(archive: Path, workspace: Path) -> Iterator[Folder]:
                         f"for {shown(name)}",
                         "render fewer or smaller views of one object",
                     )
-                target = path_inside(_place(root, name, archive), relative, archive, "member", byte_escapes=True)
+                target = path_inside(
+                    _object_folder(root, name, archive), relative, archive, "member", byte_escapes=True
+                )
                 _unpack(archive, tar, member, target)
             if current is not None:
-                yield _opened(archive, root, current)
+                yield _open_object(archive, root, current)
     finally:
         shutil.rmtree(root, ignore_errors=True)
 
 
 class _LongHeader(Exception):
-    """An extended header claims more than MAX_HEADER_BYTES.
+    """Report an extended header that claims more than MAX_HEADER_BYTES.
 
-    Not one of tarfile's errors, which tarfile would take for another format.
+    It does not derive from tarfile's errors: on those, tarfile goes on and tries another format.
     """
 
 
 class _BoundedHeader(tarfile.TarInfo):
-    """Refuse to read the extended parts of a header when they claim to be large."""
+    """Parse the headers of a tar, and refuse extended ones of more than MAX_HEADER_BYTES."""
 
     def _proc_member(self, tar: tarfile.TarFile):
         """Raise _LongHeader for a large extended header, else process it."""
@@ -120,7 +124,7 @@ class _BoundedHeader(tarfile.TarInfo):
 
 
 @contextmanager
-def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
+def _open_tar(archive: Path) -> Iterator[tarfile.TarFile]:
     """Open a tar for reading. Raises InputError where it is none."""
     require_regular_file(archive)
     try:
@@ -128,15 +132,15 @@ def _opened_tar(archive: Path) -> Iterator[tarfile.TarFile]:
     except OSError as error:
         raise from_os_error(error, archive) from None
     with file:
-        with _malformed(archive):
+        with _as_input_error(archive):
             tar = tarfile.open(fileobj=file, tarinfo=_BoundedHeader)  # noqa: SIM115 - closed by `with tar` below
         with tar:
             yield tar
 
 
 @contextmanager
-def _malformed(archive: Path) -> Iterator[None]:
-    """Convert what tarfile and the decompressors raise for bytes that are no tar to one InputError."""
+def _as_input_error(archive: Path) -> Iterator[None]:
+    """Convert the errors of tarfile and of the decompressors, for bytes that are no tar, to InputError."""
     try:
         yield
     except _LongHeader as error:
@@ -158,10 +162,10 @@ def _malformed(archive: Path) -> Iterator[None]:
 
 
 def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
-    """Yield the regular files of an archive after checking each header: its name, its kind, and the limits."""
+    """Yield the regular files of an archive. Each header's name, kind and sizes are checked first."""
     packed, count, size = max(archive.stat().st_size, 1), 0, 0
     while True:
-        with _malformed(archive):
+        with _as_input_error(archive):
             member = tar.next()
         if member is None:
             return
@@ -186,8 +190,9 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
 
 
 def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Copy a member's bytes to target. Raises InputError for a truncated archive, OutputError where target cannot be
-    written.
+    """Copy a member's bytes to target.
+
+    Raises InputError for a truncated archive, OutputError where target cannot be written.
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -197,11 +202,11 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
             raise InputError(archive, f"holds {shown(member.name)} both as a file and as a folder", _PACK) from None
         raise from_os_error(error, target) from None
     with out:
-        with _malformed(archive):
+        with _as_input_error(archive):
             source: BinaryIO = tar.extractfile(member)
         left = member.size
         while left:
-            with _malformed(archive):
+            with _as_input_error(archive):
                 block = source.read(min(left, _BLOCK))
             if not block:
                 raise InputError(archive, f"is not a whole tar file (it ends within {shown(member.name)})", _PACK)
@@ -212,8 +217,8 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
             left -= len(block)
 
 
-def _place(root: Path, name: str, archive: Path) -> Path:
-    """Return the folder under root that an object is unpacked into; data/objects.py takes its name for the object's."""
+def _object_folder(root: Path, name: str, archive: Path) -> Path:
+    """Return the folder under root that an object is unpacked into. Its parent is named after the object."""
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
     if fault:
@@ -221,9 +226,9 @@ def _place(root: Path, name: str, archive: Path) -> Path:
     return root / safe / "views"
 
 
-def _opened(archive: Path, root: Path, name: str) -> Folder:
+def _open_object(archive: Path, root: Path, name: str) -> Folder:
     """Open an unpacked views folder. Raises InputError where its manifest is missing."""
-    folder = _place(root, name, archive)
+    folder = _object_folder(root, name, archive)
     if not (folder / MANIFEST).is_file():
         raise InputError(
             archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one"

@@ -14,17 +14,17 @@ from gdtool.images.color import linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image
 from gdtool.images.mask import foreground
 
-LEAST_PIXELS = 32  # along the picture's shorter side: less shows the model nothing
-FINEST = 8  # pixels of picture.png across one of a view
+MIN_PICTURE_SIDE = 32  # along the picture's shorter side; the model needs as much detail
+MAX_FINER = 8  # most pixels of picture.png across one pixel of a view
 
 
 @dataclass(frozen=True)
 class PictureOptions:
     """Set how a picture becomes a condition.
 
-    mask: path of an image that is bright where the subject is. matting: path of an ONNX network. crop: centre and scale
-    the subject as in training, else keep the picture's framing. extent: longest side of the framed subject as a share
-    of the image. size: pixels of the condition.
+    mask: path of an image that is bright where the subject is. matting: path of an ONNX network that separates the
+    subject. crop: centre and scale the subject as in training; otherwise the picture's framing stays. extent: longest
+    side of the framed subject, as a share of the image. size: side of the condition in pixels.
     """
 
     mask: str | None
@@ -34,30 +34,34 @@ class PictureOptions:
     size: int
 
 
-def wrong_size(mask: str, size: tuple[int, int], wanted: tuple[int, int]) -> InputError:
-    """Describe a mask whose size (width, height) is not the picture's."""
+def mask_size_error(mask: str, size: tuple[int, ...], wanted: tuple[int, ...]) -> InputError:
+    """Make the error for a mask whose size (width, height) is not the picture's."""
     return InputError(
         mask, f"is {size[0]}x{size[1]}, the image {wanted[0]}x{wanted[1]}", f"scale it to {wanted[0]}x{wanted[1]}"
     )
 
 
-def condition_of(
+def make_condition(
     path: Path, name: str, options: PictureOptions, warn: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frame the picture: (size, size, 4), linear color and straight alpha, and the same at the picture's resolution.
+    """Read a picture, cut its subject out and frame it, at the model's size and at about the picture's resolution.
 
-    The second is a whole number of times finer, FINEST at most. Raises InputError without a usable subject.
+    Returns two images of the same square: (size, size, 4) and (f size, f size, 4), float32, linear color and straight
+    alpha. The whole number f, 1 to MAX_FINER, keeps the picture's resolution best. warn: called with a text where the
+    subject may be cut off. Raises InputError for a picture without a usable subject.
     """
     image = read_image(path)
-    if min(image.shape[:2]) < LEAST_PIXELS:
+    if min(image.shape[:2]) < MIN_PICTURE_SIDE:
         raise InputError(
             path,
-            f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {LEAST_PIXELS} at least",
+            f"is {image.shape[1]}x{image.shape[0]} pixels; the model needs {MIN_PICTURE_SIDE} at least",
             "give a larger picture",
         )
-    mask = read_image(Path(options.mask)) if options.mask is not None else None
-    if mask is not None and mask.shape[:2] != image.shape[:2]:
-        raise wrong_size(options.mask, mask.shape[1::-1], image.shape[1::-1])
+    mask = None
+    if options.mask is not None:
+        mask = read_image(Path(options.mask))
+        if mask.shape[:2] != image.shape[:2]:
+            raise mask_size_error(options.mask, mask.shape[1::-1], image.shape[1::-1])
     alpha = foreground(image, mask, path, warn, options.matting)
     if not (alpha > 0.5).any():
         raise InputError(path, "shows no subject: its mask is empty", "give one with --mask")
@@ -77,18 +81,18 @@ def condition_of(
     finer = (framed_side(rgba, extent) if options.crop else max(rgba.shape[:2])) / size
     condition, picture = (
         frame(rgba, side, extent) if options.crop else whole_frame(rgba, side)
-        for side in (size, size * min(max(round(finer), 1), FINEST))
+        for side in (size, size * min(max(round(finer), 1), MAX_FINER))
     )
     return condition, picture
 
 
-def extent_of(convention: str) -> float:
+def trained_extent(convention: str) -> float:
     """Return the longest side of the framed subject, as a share of the image, that a model was trained with."""
     from gdtool.diffusion.checkpoint import wonder3d
 
     return wonder3d.EXTENT if convention == "wonder3d" else FRONT_EXTENT
 
 
-def encoded_rgba(image: np.ndarray) -> np.ndarray:
-    """Encode linear color to sRGB in (h, w, 4), clipped to [0, 1]; alpha stays linear."""
+def encode_rgba(image: np.ndarray) -> np.ndarray:
+    """Encode the linear color of (h, w, 4) to sRGB, clipped to [0, 1]. Alpha is clipped only."""
     return np.concatenate([srgb_from_linear(np.clip(image[..., :3], 0, 1)), np.clip(image[..., 3:], 0, 1)], -1)

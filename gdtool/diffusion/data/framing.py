@@ -11,7 +11,7 @@ FRONT_EXTENT = 0.5 / HALF_WIDTH
 
 
 def framed_side(image: np.ndarray, extent: float = FRONT_EXTENT) -> float:
-    """Return the side, in the picture's pixels, of the square that frame() cuts out."""
+    """Return the side, in the picture's pixels, of the square that frame() cuts out of image (h, w, 4)."""
     rows, columns = np.nonzero(image[..., 3] > 0.5)
     return float(max(np.ptp(rows), np.ptp(columns)) + 1) / extent
 
@@ -19,8 +19,8 @@ def framed_side(image: np.ndarray, extent: float = FRONT_EXTENT) -> float:
 def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndarray:
     """Centre the subject's bounding box and scale its longest side to extent * size.
 
-    image (h, w, 4): linear color, straight alpha, float32 -> (size, size, 4) of the same kind. Filtered on
-    premultiplied linear values, so no background color leaks in.
+    Takes image (h, w, 4), linear color and straight alpha, float32, and returns (size, size, 4) of the same kind.
+    Filters premultiplied values, so no background color leaks in.
     """
 
     rows, columns = np.nonzero(image[..., 3] > 0.5)
@@ -30,9 +30,7 @@ def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndar
 
 
 def whole_frame(image: np.ndarray, size: int) -> np.ndarray:
-    """Resample the whole picture (h, w, 4), padded to a square with transparency, to `size`, without cropping or
-    centring.
-    """
+    """Resample the whole picture (h, w, 4), padded with transparency to a square, to (size, size, 4)."""
     h, w = image.shape[:2]
     side = max(h, w)
     square = np.zeros((side, side, 4), np.float32)
@@ -42,7 +40,10 @@ def whole_frame(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def _resample(image: np.ndarray, x0: float, y0: float, side: float, size: int) -> np.ndarray:
-    """Resample a square of the picture, corner (x0, y0) and side in pixels, to (size, size); outside is transparent."""
+    """Resample a square of the picture (h, w, 4) to (size, size, 4); pixels outside the picture are transparent.
+
+    x0, y0: the square's left and top edge; side: its side; all in pixels of the picture.
+    """
     import torch
     import torch.nn.functional as F
 

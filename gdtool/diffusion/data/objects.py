@@ -1,6 +1,7 @@
 """Decode views folders once into memory-mapped arrays, and draw training batches from them.
 
-Every choice of a step comes from a generator seeded by (seed, step), so a resumed run sees what an unbroken one would.
+Each random choice comes from a generator that is seeded by the run's seed and the step's number. So a resumed run makes
+the same choices as a run that was never stopped.
 """
 
 from __future__ import annotations
@@ -21,15 +22,16 @@ from gdtool.core.reading import read_json
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANE_COUNT, PLANES, mirrored_order, planes_from_images
 
-LIGHTS = 16
+LIGHT_COUNT = 16
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Hold decoded objects.
+    """Hold n decoded objects, with k views and c condition images each.
 
-    planes (n, k, 13, h, w) uint8; conditions (n, c, 4, h, w) uint8, the front view first; 127 is 0 in both. lights
-    (n, 16, 7) float32: axis, sharpness, amplitude.
+    planes (n, k, 13, h, w) uint8: the channels that encoding.PLANES lists. conditions (n, c, 4, h, w) uint8: red,
+    green, blue and coverage; the first is the front view. Bytes 0 to 254 stand for -1 to 1, so 127 is 0. lights (n, 16,
+    7) float32: axis, sharpness and amplitude of spherical Gaussians. names: one for each object.
     """
 
     planes: np.ndarray
@@ -42,17 +44,17 @@ class Objects:
         return len(self.planes)
 
     def part(self, chosen: slice) -> Objects:
-        """Return the objects in a slice."""
+        """Return the objects that a slice selects."""
         return Objects(self.planes[chosen], self.conditions[chosen], self.lights[chosen], self.names[chosen])
 
 
 def to_bytes(x: np.ndarray) -> np.ndarray:
-    """Quantise [-1, 1] to 0…254, with 0 exactly at 127."""
+    """Quantise [-1, 1] to the bytes 0 to 254, with 0 exactly at 127."""
     return np.round((np.clip(x, -1, 1) + 1) * 127).astype(np.uint8)
 
 
 def from_bytes(x: np.ndarray) -> torch.Tensor:
-    """Convert bytes 0…254 back to [-1, 1]."""
+    """Convert the bytes 0 to 254 back to [-1, 1]."""
     return torch.from_numpy(np.array(x)).float() / 127 - 1  # a copy: memory maps are read-only
 
 
@@ -65,7 +67,10 @@ def shrink(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def condition_plane(image: np.ndarray) -> np.ndarray:
-    """Encode a condition image (h, w, 4), linear color and straight alpha in [0, 1], as (4, h, w), premultiplied."""
+    """Encode a condition image (h, w, 4), linear color and straight alpha in [0, 1], as (4, h, w) in [-1, 1].
+
+    Color c becomes 2c - 1 in sRGB times coverage; coverage m becomes 2m - 1.
+    """
     from gdtool.images.color import srgb_from_linear
 
     alpha = image[..., 3]
@@ -74,7 +79,12 @@ def condition_plane(image: np.ndarray) -> np.ndarray:
 
 
 def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decode one object to premultiplied planes (k, 13, h, w), conditions (c, 4, h, w) and light (16, 7)."""
+    """Decode an object's views folder to the arrays that training reads, at the configuration's image size.
+
+    Returns planes (k, 13, h, w) as encoding.planes_from_images() makes them, conditions (c, 4, h, w) as
+    condition_plane() makes them, and light (16, 7): axis, sharpness and amplitude of spherical Gaussians. Raises
+    InputError for a folder that lacks a view or a domain, or whose size is no multiple of the model's.
+    """
     from gdtool.diffusion.data.framing import frame
     from gdtool.folders.views import read_views
     from gdtool.images.color import linear_from_srgb
@@ -108,13 +118,13 @@ def decode_object(folder: Folder, config: ModelConfig) -> tuple[np.ndarray, np.n
         image = image.astype(np.float32) / np.iinfo(image.dtype).max
         if image.ndim == 3 and image.shape[2] == 4 and image[..., 3].max() > 0.5:
             image = np.concatenate([linear_from_srgb(image[..., :3]), image[..., 3:]], -1)
-            # Centred, and as large as the front view: a picture's scale is what the rig's scale is relative to.
+            # Centred and as large as in the front view, as a picture is framed when sampling.
             conditions.append(condition_plane(frame(image, size, extent)))
     conditions = [shrink(c, size) for c in conditions]
-    light = np.zeros((LIGHTS, 7), np.float32)
+    light = np.zeros((LIGHT_COUNT, 7), np.float32)
     if views.light is not None:
         rows = np.concatenate([views.light["axes"], views.light["sharpness"][:, None], views.light["amplitudes"]], 1)
-        light[: len(rows)] = rows[:LIGHTS]
+        light[: len(rows)] = rows[:LIGHT_COUNT]
     light[:, 2] += (light[:, :3] == 0).all(1)  # an unused light still needs a unit axis
     return shrink(planes, size), np.stack(conditions), light
 
@@ -128,17 +138,25 @@ def bounding_side(alpha: np.ndarray) -> float:
 def decode_dataset(
     folders: Iterable[Folder], count: int, config: ModelConfig, cache: Path, conditions: int = 5, warn=lambda text: None
 ) -> Objects:
-    """Decode views folders into cache (kept between runs) and map the arrays.
+    """Decode views folders into files in cache, unless they are there already, and memory-map them.
 
-    An object that cannot be used is left out with a warning. conditions: most condition images kept per object; objects
-    that have fewer repeat theirs. Raises InputError when no object is usable.
+    Args:
+        folders: the views folders; not read where cache is complete.
+        count: number of objects that the files have space for, at least the number of folders.
+        config: gives the image size, the views and the domains.
+        cache: folder that is kept between runs.
+        conditions: condition images stored for each object; an object that has fewer repeats them.
+        warn: called with a text for each object that cannot be used; it is left out.
+
+    Returns:
+        The decoded objects. Raises InputError when no object is usable.
     """
     h, k = config.image_size, len(config.views)
     names_file = cache / "objects.json"
     files = {
         "planes": ((k, PLANE_COUNT, h, h), np.uint8),
         "conditions": ((conditions, 4, h, h), np.uint8),
-        "lights": ((LIGHTS, 7), np.float32),
+        "lights": ((LIGHT_COUNT, 7), np.float32),
     }
     if not names_file.is_file():
         arrays = {
@@ -161,7 +179,7 @@ def decode_dataset(
             array.flush()
         part = names_file.with_suffix(".part")
         part.write_text(json.dumps(names))
-        part.replace(names_file)  # a killed run leaves no half of it
+        part.replace(names_file)  # a killed run leaves no partial file
     names = read_json(names_file)
     if not names:
         raise InputError("dataset", "has no object that can be trained on", "render it with gdtool render-dataset")
@@ -171,7 +189,11 @@ def decode_dataset(
 
 @dataclass(frozen=True)
 class Batch:
-    """Hold a step's inputs: planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7); no background yet."""
+    """Hold the inputs of a training step for b objects with k views.
+
+    planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7): float32, as Objects stores them but in [-1, 1].
+    Nothing is composited over a background yet.
+    """
 
     planes: torch.Tensor
     condition: torch.Tensor
@@ -179,22 +201,27 @@ class Batch:
 
 
 def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
-    """Return the indices of a step's objects: a new permutation each pass over the data."""
+    """Return the indices (batch,) of a step's objects, out of count. Each pass over the data is a new permutation."""
     positions = step * batch + np.arange(batch)
     epochs = positions // count
     orders = {epoch: np.random.default_rng((seed, 1, int(epoch))).permutation(count) for epoch in np.unique(epochs)}
     return np.array([orders[epoch][position % count] for epoch, position in zip(epochs, positions, strict=True)])
 
 
-def draw(
+def draw_batch(
     objects: Objects,
     idx: np.ndarray,
     config: ModelConfig,
     train: TrainConfig,
     generators: Sequence[np.random.Generator],
 ) -> Batch:
-    """Draw a batch of the objects idx: random condition images, mirroring and permuted colors, a generator each."""
-    planes, rgba, lights = [], [], []
+    """Make a batch of the objects idx (b,), with random condition images, mirroring and permuted color channels.
+
+    generators: one for each object, so that the result does not depend on how a batch is split.
+    """
+    planes: list[torch.Tensor] = []
+    rgba: list[torch.Tensor] = []
+    lights: list[torch.Tensor] = []
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
@@ -204,7 +231,7 @@ def draw(
             torch.from_numpy(np.array(objects.lights[i])),
         )
         if train.mirror and generator.random() < 0.5:
-            sample = mirror(*sample, config.views)
+            sample = mirror_object(*sample, config.views)
         if train.hue:
             sample = permute_colors(*sample, generator.permutation(3))
         for out, value in zip((planes, rgba, lights), sample, strict=True):
@@ -212,8 +239,12 @@ def draw(
     return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
 
 
-def mirror(planes, rgba, light, views: tuple[str, ...]):
-    """Mirror an object about its x = 0 plane: views swap sides, x of normals and lights changes sign."""
+def mirror_object(planes, rgba, light, views: tuple[str, ...]):
+    """Mirror one object about the plane x = 0.
+
+    Takes planes (k, 13, h, w), rgba (4, h, w), light (16, 7) and the views' names. Left and right views are exchanged;
+    the x of normals and of light axes changes its sign.
+    """
     order = mirrored_order(views)
     planes = planes[order].flip(-1)
     x = PLANES["normal"].start
@@ -224,9 +255,10 @@ def mirror(planes, rgba, light, views: tuple[str, ...]):
 
 
 def permute_colors(planes, rgba, light, order):
-    """Permute red, green and blue of color, albedo, condition and light.
+    """Permute the red, green and blue of one object's color, albedo, condition and light.
 
-    Light transport is the same for each channel, so the result is a valid object.
+    Takes planes (k, 13, h, w), rgba (4, h, w), light (16, 7) and order, a permutation of (0, 1, 2). Light transport is
+    the same for each channel, so the result is an object that could exist.
     """
     planes, rgba, light = planes.clone(), rgba.clone(), light.clone()
     for domain in ("color", "albedo"):
@@ -237,6 +269,6 @@ def permute_colors(planes, rgba, light, order):
     return planes, rgba, light
 
 
-def to_tensor_condition(image: np.ndarray) -> torch.Tensor:
-    """Encode one framed image (h, w, 4), linear, as a batch of one."""
+def condition_batch(image: np.ndarray) -> torch.Tensor:
+    """Encode one framed image (h, w, 4), linear color and straight alpha, as a batch (1, 4, h, w) in [-1, 1]."""
     return torch.from_numpy(condition_plane(image)).unsqueeze(0)

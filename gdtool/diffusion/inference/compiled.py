@@ -1,4 +1,4 @@
-"""Sample with a compiled network: where PyTorch keeps what it compiles, and what is told where it cannot compile."""
+"""Sample with a compiled network: choose PyTorch's cache folder, and report where it cannot compile."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ CACHE_VARIABLE = "TORCHINDUCTOR_CACHE_DIR"
 
 @contextlib.contextmanager
 def compiler_cache() -> Iterator[None]:
-    """Have PyTorch keep compiled code in the user's cache folder, or in a temporary one where that is not writable.
+    """Set PyTorch's cache of compiled code to a folder in the user's cache.
 
-    By default PyTorch leaves a folder in TMPDIR. TORCHINDUCTOR_CACHE_DIR, where it is set, is respected.
+    Where that is not writable, the cache is a temporary folder; by default PyTorch leaves one in TMPDIR. A
+    TORCHINDUCTOR_CACHE_DIR that is set already is kept.
     """
     if CACHE_VARIABLE in os.environ:
         yield

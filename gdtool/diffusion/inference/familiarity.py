@@ -1,11 +1,11 @@
-"""Warn of pictures unlike the training data, and of results that the model is unsure of.
+"""Warn of pictures that are unlike the training data, and of results that the model is unsure of.
 
-Figures of the picture are compared with their range over the training pictures, and figures of the result with their
-usual values. The image encoder's features do not tell: photographs of anything lie among the training objects, whose
-tail reaches far further. So the picture's figures are ones that a user can read and act upon. They seldom tell either;
-a model's uncertainty shows in its result (docs/benchmarks/model_doubt.md). One step of sampling gives the mean of all
-outlines that the model holds possible, which is a blur. It may also lose parts; then the picture fills rows of the
-frame that the other views leave empty.
+Figures of the picture are compared with their range over the training pictures. Figures of the result are compared with
+their usual values. Both are quantities that a user can read and act upon. Features of the image encoder would not
+serve: photographs of anything lie among those of the training objects, which spread far wider. Figures of the picture
+seldom show a problem either; the model's uncertainty shows in its result (docs/benchmarks/model_doubt.md). One step of
+sampling gives the mean of all outlines that the model holds possible, which is a blur. It may also lose parts. The
+picture then fills rows of the frame that the other views leave empty.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-FILE = "pictures.json"  # in a model folder
+RANGES_FILE = "pictures.json"  # in a model folder
 TAIL = 0.005  # share of the training pictures left out at each end
 MARGIN = 0.1  # of the range, added at each end
-# Figures of a result (result_figures) and what one of them, and the usual most of it, says to the user.
+# Figures of a result (result_figures), and the text of a warning with its value and its usual maximum.
 DOUBTS = {
     "outline_blur": "their outlines are blurred over {:.1f} pixels, {:.1f} at most is usual",
     "row_mismatch": "they begin or end at another height than the picture, in {:.1%} of the frame, "
@@ -27,14 +27,17 @@ DOUBTS = {
 
 
 class PictureRange(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Hold the least and greatest of a figure over the training pictures, their tails left out."""
+    """Hold the range of a figure over the training pictures, without the share TAIL of them at each end."""
 
     low: float
     high: float
 
 
 def picture_figures(rgba: np.ndarray) -> dict[str, float]:
-    """Compute the figures of a condition (4, h, w): premultiplied encoded color and coverage in [-1, 1]."""
+    """Measure how a subject fills its frame, its outline, brightness and texture; returns figures by name.
+
+    rgba (4, h, w): condition in [-1, 1], sRGB color times coverage, then coverage.
+    """
     alpha = 0.5 + 0.5 * rgba[3]
     inside = alpha > 0.5
     if not inside.any():
@@ -43,7 +46,7 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
     height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
     color = 0.5 + 0.5 * rgba[:3] / np.maximum(alpha, 1e-3)
     grey = color.mean(0)
-    # neighbours that are both inside: texture, and how much of the box's outline the subject has
+    # differences of neighbouring pixels, and whether both are inside
     steps = [
         (
             np.abs(np.diff(grey, axis=a)),
@@ -66,16 +69,19 @@ def picture_figures(rgba: np.ndarray) -> dict[str, float]:
     }
 
 
-def ranges(conditions) -> dict[str, PictureRange]:
-    """Compute the range of each figure over an iterable of conditions (4, h, w)."""
+def figure_ranges(conditions) -> dict[str, PictureRange]:
+    """Compute the range of each figure of picture_figures() over an iterable of conditions (4, h, w)."""
     every = [picture_figures(np.asarray(figures, np.float32)) for figures in conditions]
     names = list(dict.fromkeys(name for figures in every for name in figures))
     columns = {name: np.array([figures[name] for figures in every if name in figures]) for name in names}
     return {name: PictureRange(*(float(np.quantile(x, q)) for q in (TAIL, 1 - TAIL))) for name, x in columns.items()}
 
 
-def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
-    """Describe the figures of a condition that lie outside the training pictures' range; empty where none does."""
+def describe_unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
+    """List descriptions of the figures of a condition (4, h, w) that lie outside their range in training.
+
+    known: the range of each figure by name. A figure without a range is not checked.
+    """
     descriptions = []
     for name, value in picture_figures(rgba).items():
         if name not in known:
@@ -88,15 +94,18 @@ def unfamiliar(rgba: np.ndarray, known: dict[str, PictureRange]) -> list[str]:
 
 
 def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.ndarray | None = None) -> dict[str, float]:
-    """Measure how unsure a model was of the views that the picture does not show: the figures in DOUBTS.
+    """Measure the blur of sampled outlines, and the rows in which they differ from the picture.
 
-    coverage (k, h, w) in [0, 1], as the model made it. front: index of the view whose silhouette is the picture's
-    coverage alpha (h, w); without it all views count, and only outline_blur is returned.
+    Args:
+        coverage: (k, h, w) in [0, 1], as the model sampled it.
+        front: index of the view that shows the picture's side; None counts all views and leaves row_mismatch out.
+        alpha: (h, w), the picture's coverage, which is that view's silhouette.
 
-    outline_blur: width in pixels of the ramp from 0 to 1 across the outlines. A linear ramp's m (1 - m) adds up to a
-    sixth of its width; the outlines' length is counted along rows and columns. row_mismatch: upright orthographic views
-    side by side fill the same rows. It is the difference between each row's greatest coverage and that of the picture's
-    row, mean over all rows of the frame.
+    Returns:
+        outline_blur: mean width in pixels of the ramp from 0 to 1 across the outlines of the other views. A linear
+            ramp's m (1 - m) adds up to a sixth of its width. The outlines' length is counted along rows and columns.
+        row_mismatch: mean over rows of the difference between the greatest coverage in the other views and in the
+            picture, 0 to 1. Upright orthographic views side by side fill the same rows.
     """
     unseen = np.asarray([view for k, view in enumerate(coverage) if k != front], np.float64)
     inside = unseen > 0.5
@@ -107,10 +116,11 @@ def result_figures(coverage: np.ndarray, front: int | None = None, alpha: np.nda
     return out
 
 
-def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
-    """Compute ranges of the result's figures up to a common quantile.
+def usual_ranges(results: list[dict[str, float]], alarms: float) -> dict[str, PictureRange]:
+    """Compute the usual range of each figure of result_figures() from the figures of many results.
 
-    It is the lowest quantile at which at most the share `alarms` of these results leaves one of the ranges.
+    The upper end of a range is a quantile of its figure. The quantile is common to all figures: the lowest for which at
+    most the share `alarms` of the results, 0 to 1, lies outside any range.
     """
     columns = np.array([[figures[name] for name in DOUBTS] for figures in results])  # (n, figures)
     for quantile in np.linspace(1 - alarms, 1, 101):
@@ -120,8 +130,8 @@ def limits(results: list[dict[str, float]], alarms: float) -> dict[str, PictureR
     return {name: PictureRange(0.0, float(value)) for name, value in zip(DOUBTS, high, strict=True)}
 
 
-def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
-    """Describe the figures of a result that lie above the usual; empty where none does."""
+def describe_doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str]:
+    """List descriptions of the figures of a result that lie above their usual range, by name in `known`."""
     return [
         words.format(result[name], known[name].high)
         for name, words in DOUBTS.items()
@@ -130,16 +140,16 @@ def doubts(result: dict[str, float], known: dict[str, PictureRange]) -> list[str
 
 
 def write_ranges(path: Path, known: dict[str, PictureRange]) -> None:
-    """Write ranges as JSON."""
+    """Write the range of each figure, by name, as JSON."""
     path.write_bytes(msgspec.json.format(msgspec.json.encode(known), indent=1) + b"\n")
 
 
 def read_ranges(folder: Path) -> dict[str, PictureRange]:
-    """Read a model folder's ranges; empty where it has none. Raises InputError when damaged."""
+    """Read the ranges of a model folder, by figure; empty where it has none. Raises InputError for a damaged file."""
     from gdtool.core.errors import InputError
     from gdtool.core.reading import read_json
 
-    path = Path(folder) / FILE
+    path = Path(folder) / RANGES_FILE
     if not path.exists():
         return {}
     try:

@@ -1,4 +1,4 @@
-"""Sample a condition's images and tell the user what to expect of them."""
+"""Sample the views of a picture, and warn the user where they are likely to be poor."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import torch
 from gdtool.core.errors import UsageError
 from gdtool.core.stage import Output
 from gdtool.diffusion.config import ModelConfig
-from gdtool.diffusion.data.objects import to_tensor_condition
+from gdtool.diffusion.data.objects import condition_batch
 from gdtool.diffusion.inference.compiled import sample_compiled
-from gdtool.diffusion.inference.familiarity import doubts, read_ranges, unfamiliar
+from gdtool.diffusion.inference.familiarity import describe_doubts, describe_unfamiliar, read_ranges
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.model import Model
 
@@ -39,15 +39,17 @@ def sample_condition(
     name: str,
     out: Output,
 ) -> dict[str, torch.Tensor]:
-    """Sample a framed picture (size, size, 4); returns domain to encoded images (1, k, 3, h, w).
+    """Sample all views from a framed picture (size, size, 4); returns encoded images (1, k, 3, h, w) by domain.
 
-    Warns of a picture unlike the model's training, whose ranges ranges_folder holds. name: of the picture.
+    ranges_folder: model folder with the ranges of the training pictures; a picture outside them causes a warning.
+    compiled: whether to compile the network first. name: the picture's name in warnings.
     """
-    rgba = to_tensor_condition(condition)
-    strange = unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
+    rgba = condition_batch(condition)
+    strange = describe_unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
     if strange:
-        out.warn(f"{name}: unlike the pictures this model was trained on, expect less of it: {'; '.join(strange)}")
-    # The memory order that convolutions work in; a twentieth quicker, the same to rounding.
+        figures = "; ".join(strange)
+        out.warn(f"{name}: unlike the pictures that this model was trained on, so its views may be poor: {figures}")
+    # The memory layout that convolutions work in: 5 % faster, the same up to rounding.
     model.unet.to(memory_format=torch.channels_last)
     sample = sample_compiled if compiled else sample_images
     images = sample(model, rgba.to(out.device), options, progress=out.progress)
@@ -56,7 +58,7 @@ def sample_condition(
     return images
 
 
-def tell_doubts(
+def warn_of_doubts(
     ranges_folder: Path,
     report: dict[str, float],
     config: ModelConfig,
@@ -64,9 +66,10 @@ def tell_doubts(
     name: str,
     out: Output,
 ) -> None:
-    """Warn where the result's figures show that the model is unsure of it.
+    """Warn where the figures of a result exceed their usual range: the model is unsure of its views.
 
-    The usual values were measured with the model's default options, so nothing is told with others.
+    report: the figures, as result.views_from_images() returns them. The usual ranges were measured with the model's
+    default options. With other options no warning is given, and the manifest lists the check as skipped.
     """
     default = (
         options.steps == config.sampling_steps
@@ -77,10 +80,10 @@ def tell_doubts(
     if not default:
         out.skip(
             "the model's doubt of its result",
-            "what is usual is known of the model's own steps, without guidance, in all domains",
+            "its usual figures were measured with the model's default steps, without guidance, in all domains",
         )
         return
-    unsure = doubts(report, read_ranges(ranges_folder))
+    unsure = describe_doubts(report, read_ranges(ranges_folder))
     if unsure:
         out.warn(
             f"{name}: the model is unsure of the views that the picture does not show ({'; '.join(unsure)}): "

@@ -7,40 +7,38 @@ import torch
 
 from gdtool.cameras import Camera, backproject, project
 from gdtool.diffusion.inference.familiarity import result_figures
-from gdtool.diffusion.inference.outline import draw_part, grown_masks, lost_part
-from gdtool.diffusion.inference.paint import repainted
+from gdtool.diffusion.inference.outline import add_part_to_masks, draw_part, find_lost_part
+from gdtool.diffusion.inference.paint import restore_albedo_contrast
 from gdtool.diffusion.network.encoding import coverage, decode
 from gdtool.folders.views import Views
 
-# The model's coverage at which outlines overlap the true ones most, at no cost in color; at one half they hold 4 % too
+# Sampled coverage at which outlines overlap the true ones most, at no cost in color; at one half they cover 4 % too
 # little.
-OUTLINE = 0.45
-# Metal or not: the power by which a model's leaning is taken for its answer. From 3 on nothing is gained on held-out
-# objects; edges stay soft.
-DECIDED = 4
+OUTLINE_COVERAGE = 0.45
+# Power that the odds of metallic are raised to. Above 3 it makes no difference on held-out objects; edges stay soft.
+METALLIC_POWER = 4
 
 
 def sharpen(mask: torch.Tensor) -> torch.Tensor:
-    """Double the slope of a model's coverage at the outline.
+    """Double the slope of sampled coverage (…, h, w), 0 to 1, around the value OUTLINE_COVERAGE.
 
-    It is soft where the model is unsure of the outline; a real outline is a pixel wide.
+    Coverage is soft where the model is unsure of the outline, but a real outline is one pixel wide.
     """
-    return ((mask - OUTLINE) * 2 + 0.5).clamp(0, 1)
+    return ((mask - OUTLINE_COVERAGE) * 2 + 0.5).clamp(0, 1)
 
 
-def decided(metallic: torch.Tensor) -> torch.Tensor:
-    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer: the odds to the power DECIDED.
+def sharpen_metallic(metallic: torch.Tensor) -> torch.Tensor:
+    """Push metallic in [0, 1] toward 0 or 1, whichever is nearer, by raising its odds to the power METALLIC_POWER.
 
-    A material is a metal or is none. A model's value in between says how sure it is, and is on average nearest at
-    neither.
+    A material is a metal or it is none. A sampled value in between says how sure the model is.
     """
-    yes, no = metallic**DECIDED, (1 - metallic) ** DECIDED
+    yes, no = metallic**METALLIC_POWER, (1 - metallic) ** METALLIC_POWER
     return yes / (yes + no)
 
 
-def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
-    """Average the coverage (k, h, w) of orthographic cameras that face one another: they see one outline, mirrored."""
-    out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # the other's axes, as seen from a camera
+def average_opposite_views(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
+    """Average the coverage (k, h, w) of orthographic views from opposite sides, whose outlines are mirror images."""
+    out, facing = soft.clone(), np.diag([-1.0, 1.0, -1.0])  # axes of the opposite camera in this camera's frame
     for k, camera in enumerate(cameras):
         for other, opposite in enumerate(cameras):
             if camera.projection == opposite.projection == "orthographic" and np.allclose(
@@ -50,11 +48,12 @@ def tied(soft: torch.Tensor, cameras: list[Camera]) -> torch.Tensor:
     return out
 
 
-def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
-    """Move depth (k, h, w) so that no point lies beyond the outline of another view, coverage (k, h, w), in its row.
+def move_depth_within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera]) -> np.ndarray:
+    """Move depth (k, h, w) so that no point projects outside the outline of another view.
 
-    A point is moved along its ray, within the camera's range. Only pairs of upright orthographic cameras of one size
-    take part, whose rows are at one height: one view's rays run along the other's rows.
+    mask (k, h, w) is the views' coverage, 0 to 1. A point moves along its ray, between the camera's near and far plane.
+    Only pairs of upright orthographic cameras at one height and of one pixel size take part. Their rows match, so a ray
+    of one view projects into a row of the other.
     """
     out, (height, width) = depth.astype(np.float64), mask.shape[1:]
     for k, camera in enumerate(cameras):
@@ -74,19 +73,20 @@ def within_silhouettes(depth: np.ndarray, mask: np.ndarray, cameras: list[Camera
                 or camera.pixel_size != other.pixel_size
             ):
                 continue
-            shown = (mask[j] > 0.5).any(1)
-            first, last = _begin(mask[j]), width - _begin(mask[j][:, ::-1])
+            row_covered = (mask[j] > 0.5).any(1)
+            first, last = _first_covered_column(mask[j]), width - _first_covered_column(mask[j][:, ::-1])
             column = project(other, backproject(camera, out[k]).reshape(-1, 3))[0][:, 0].reshape(height, width)
-            lacking = np.clip(column, first[:, None], last[:, None]) - column
-            out[k] += np.where(inside & shown[:, None], lacking / per_depth, 0.0)
-        # Outlines that contradict one another would move points anywhere.
+            outside_by = np.clip(column, first[:, None], last[:, None]) - column
+            out[k] += np.where(inside & row_covered[:, None], outside_by / per_depth, 0.0)
+        # Contradictory outlines would move points out of the camera's range.
         out[k] = np.where(inside, np.clip(out[k], camera.near, camera.far), out[k])
     return out.astype(np.float32)
 
 
-def _begin(mask: np.ndarray) -> np.ndarray:
-    """Find the column (h,) at which each row's coverage (h, w) first passes one half, between pixel centres; 0 where
-    never.
+def _first_covered_column(mask: np.ndarray) -> np.ndarray:
+    """Find the column (h,) at which the coverage (h, w) of each row first reaches one half.
+
+    Interpolates between pixel centres; pixel i covers i to i + 1. Returns 0 for a row that stays below one half.
     """
     row, first = np.arange(len(mask)), (mask > 0.5).argmax(1)
     inner, outer = mask[row, first], np.where(first > 0, mask[row, first - 1], 0.0)
@@ -100,19 +100,26 @@ def views_from_images(
     domains: tuple[str, ...],
     picture_alpha: np.ndarray | None = None,
 ) -> tuple[Views, dict[str, float]]:
-    """Convert encoded images (k, 3, h, w) of one object to Views of the asked domains, with one mask per view, and a
-    report.
+    """Convert encoded images (k, 3, h, w) of one object to the Views of some domains, and report what was corrected.
 
-    picture_alpha (h, w): coverage of the framed picture. It is the front view's silhouette and, mirrored, the back's
-    (both orthographic), so neither is guessed. The front color, nearly the picture itself, is divided by it.
+    Args:
+        images: by domain, as sample_images() returns them, of one object.
+        cameras: of the k views.
+        background: encoded value that the images are composited over.
+        domains: those to return.
+        picture_alpha: (h, w), coverage of the framed picture. It replaces the sampled silhouette of the front view and,
+            mirrored, that of the back view. The front view's color is divided by it, since that color is nearly the
+            picture.
 
-    The report: drawn_share of the picture that the other views had no room for (outline.py); painted_share whose albedo
-    got the picture's contrast (paint.py); outline_blur in pixels and row_mismatch (familiarity.result_figures).
+    Returns:
+        The views with one mask each, and a report. drawn_share: share of the picture that the other views had no space
+            for (see outline.py). painted_share: share whose albedo got the picture's contrast (see paint.py).
+            outline_blur in pixels and row_mismatch: see familiarity.result_figures().
     """
     from gdtool.images.color import linear_from_srgb
 
     soft = coverage(images, background)
-    mask = sharpen(tied(soft, cameras)).numpy()
+    mask = sharpen(average_opposite_views(soft, cameras)).numpy()
     values = decode(images, soft, background)
     if picture_alpha is not None:
         known = np.ascontiguousarray(picture_alpha, np.float32)
@@ -128,11 +135,11 @@ def views_from_images(
     part, before, names = None, mask, [camera.name for camera in cameras]
     front = names.index("front") if picture_alpha is not None and "front" in names else None
     if front is not None:
-        part = lost_part(
+        part = find_lost_part(
             soft.numpy(), mask, cameras, front, values["depth"][front].numpy() if "depth" in images else None
         )
-    if part is not None:
-        mask = grown_masks(part, mask, cameras, front)
+    if part is not None and front is not None:
+        mask = add_part_to_masks(part, mask, cameras, front)
     out = {}
     for domain in images:
         if domain not in domains:
@@ -143,18 +150,20 @@ def views_from_images(
         elif domain == "normal":
             value = np.moveaxis(value, 1, -1)
         elif domain == "metallic":
-            value = decided(values[domain]).numpy()
+            value = sharpen_metallic(values[domain]).numpy()
         if domain == "depth":
-            value = within_silhouettes(value, mask, cameras)
+            value = move_depth_within_silhouettes(value, mask, cameras)
         inside = mask > 0
         out[domain] = np.where(inside[..., None] if value.ndim == 4 else inside, value, 0).astype(np.float32)
     report = {"drawn_share": 0.0, "painted_share": 0.0} | result_figures(soft.numpy(), front, picture_alpha)
     if front is not None and "albedo" in out and "color" in values:
         color = linear_from_srgb(np.moveaxis(values["color"][front].numpy(), 0, -1))
         normal, metallic = (out[domain][front] if domain in out else None for domain in ("normal", "metallic"))
-        out["albedo"][front], share = repainted(out["albedo"][front], color, mask[front], normal, metallic)
+        out["albedo"][front], share = restore_albedo_contrast(
+            out["albedo"][front], color, mask[front], normal, metallic
+        )
         report["painted_share"] = float((share * mask[front]).sum() / max(mask[front].sum(), 1.0))
-    if part is not None:
+    if part is not None and front is not None:
         draw_part(part, out, before, cameras, front)
         report["drawn_share"] = float(part.lost.sum() / (mask[front] > 0.5).sum())
     return Views(cameras, out, mask.astype(np.float32)), report

@@ -12,25 +12,26 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirrored
+from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirror_images
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import sample
 
 
 def precision_context(device: torch.device | str, precision: str):
-    """Return the networks' autocast context; lighting arithmetic stays outside it."""
+    """Return the autocast context for the networks. Lighting is computed outside of it, in float32."""
     kind = torch.device(device).type
     return torch.autocast(kind, torch.bfloat16) if precision == "bfloat16" else nullcontext()
 
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """Set how a model is sampled.
+    """Set how views are sampled from a model.
 
-    domains: to return. Where color is primary it is sampled even when it is not among them. guided_from, guided_to:
-    timesteps, as shares of all, between which guidance acts. Elsewhere there is none, and half the work (Kynkäänniemi
-    et al. 2024). mirror: average at each step the predictions for the picture and for its mirror image; None: as the
-    configuration says, where it can.
+    domains: those to return. In a model with attention across domains, color is sampled even where it is not returned.
+    steps: number of denoising steps. guidance: factor of classifier-free guidance; 1 is none. guided_from, guided_to:
+    it acts between these timesteps only, as shares of all, 0 to 1; other steps take half the time (Kynkäänniemi et al.
+    2024). mirror: average, at each step, the predictions for the picture and for its mirror image; None follows the
+    configuration, where the model can do it.
     """
 
     domains: tuple[str, ...] = DOMAINS
@@ -54,12 +55,12 @@ def sample_images(
 ) -> dict[str, torch.Tensor]:
     """Sample every view of the domains for a batch of objects.
 
-    rgba (b, 4, h, w): framed condition, premultiplied and encoded (objects.condition_plane). Returns domain to encoded
-    images (b, k, 3, h, w) over the first of the configuration's backgrounds. Noise depends on the seed alone, neither
-    on the batch nor on the domains.
+    rgba (b, 4, h, w): framed condition in [-1, 1], as objects.condition_plane() encodes it. Returns encoded images (b,
+    k, 3, h, w) by domain, over the first of the configuration's backgrounds. The noise depends on the seed alone, so an
+    object's views do not depend on the rest of the batch.
     """
     config, device = model.config, rgba.device
-    mirror = _mirrors(config, options)
+    mirror = _averages_mirror_image(config, options)
     rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
     b = len(rgba)
     wanted = [d for d in config.domains if d in options.domains]
@@ -72,12 +73,12 @@ def sample_images(
     noise = noise.unflatten(0, (len(DOMAINS), len(views)))[list(indices)].flatten(0, 1).repeat(b, 1, 1, 1).to(device)
 
     def mirror_latents(latents):
-        """Mirror the latents of some of the objects."""
+        """Mirror latents (n, c, h, w) of whole objects about x = 0: decode, mirror, encode."""
         images = model.codec.decode(latents).unflatten(0, (-1, len(indices), len(views)))
-        return model.codec.encode(mirrored(images, indices, config.views).flatten(0, 2))
+        return model.codec.encode(mirror_images(images, indices, config.views).flatten(0, 2))
 
     def with_mirror_images(latents):
-        """Append the mirror images' latents."""
+        """Append the latents of the mirrored images to latents (n, c, h, w), which gives (2 n, c, h, w)."""
         return torch.cat([latents, mirror_latents(latents)])
 
     if mirror:
@@ -99,13 +100,15 @@ def sample_images(
     bar = iter(progress(range(options.steps), options.steps, "sampling"))
 
     def denoise(x, t, i):
-        """Predict x_0 at timestep t."""
+        """Predict x_0 from x (n, c, h, w) at timestep t; i is the step's number."""
         next(bar, None)
         both = guided and options.guided_from <= t / (config.timesteps - 1) <= options.guided_to
-        seen, told, layout = double if both else (condition, context, single)
+        condition_in, context_in, layout = double if both else (condition, context, single)
         times = torch.full((layout.objects,), t, device=device)
         with precision_context(device, options.precision):
-            clean = model.predict_clean(x.repeat(2, 1, 1, 1) if both else x, seen, times, told, layout, views)
+            clean = model.predict_clean(
+                x.repeat(2, 1, 1, 1) if both else x, condition_in, times, context_in, layout, views
+            )
         if both:
             with_condition, without = clean.chunk(2)
             clean = without + options.guidance * (with_condition - without)
@@ -123,8 +126,8 @@ def sample_images(
     return {d: images[:, j] for j, d in enumerate(wanted)}
 
 
-def _mirrors(config: ModelConfig, options: SamplingOptions) -> bool:
-    """Decide whether to average with the mirrored picture. Raises InputError where that is asked for and impossible."""
+def _averages_mirror_image(config: ModelConfig, options: SamplingOptions) -> bool:
+    """Decide whether to average with the mirrored picture. Raises InputError where it is required and impossible."""
     possible = (
         config.codec == "patch"
         and config.convention == "gdtool"

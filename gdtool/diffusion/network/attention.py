@@ -1,7 +1,7 @@
-"""Attention inside an image, across the views of an object and across its domains.
+"""Attend inside an image, across the views of an object and across its domains.
 
-Tokens are (b * d * k, t, c): objects b, domains d, views k, in this order, t pixels of c channels. Module names are
-those of diffusers' transformer blocks, so that Stable Diffusion's keys map one to one.
+Tokens are (b * d * k, t, c): b objects, d domains and k views, in this order, with t tokens of c channels for each
+image. Modules have the names of diffusers' transformer blocks, so that Stable Diffusion's keys map one to one.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from gdtool.core.kinds import DOMAINS
 
 
 def learned_position(count: int, width: int) -> nn.Parameter:
-    """Create a position embedding (count, width) that starts as noise.
+    """Create a position embedding (count, width) of random values; on the meta device, without values.
 
-    On the meta device no noise is drawn: that alone would load PyTorch's compiler, a second.
+    Random numbers on the meta device would load PyTorch's compiler, which takes a second.
     """
     shape = torch.empty(count, width)
     return nn.Parameter(shape if shape.is_meta else 0.1 * torch.randn(count, width))
@@ -26,7 +26,7 @@ def learned_position(count: int, width: int) -> nn.Parameter:
 
 @dataclass(frozen=True)
 class Layout:
-    """Which images a batch holds: b objects, each with the same domains (indices into DOMAINS) and k views."""
+    """Describe the images of a batch: b objects, each with the same domains (indices into DOMAINS) and k views."""
 
     objects: int
     domains: tuple[int, ...]
@@ -34,12 +34,12 @@ class Layout:
 
     @property
     def images(self) -> int:
-        """Return the number of images."""
+        """Return the number of images, b d k."""
         return self.objects * len(self.domains) * self.views
 
 
 def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """softmax(q kᵀ / √d) v over (…, heads, tokens, d)."""
+    """Compute softmax(q kᵀ / √d) v for q (…, heads, t, d) and k, v (…, heads, m, d)."""
     if q.device.type == "cpu" and k.shape[-2] <= 2048:
         # Measured on Zen 5 (bfloat16, 384 tokens): 9 ms forward and backward against 27 ms of torch's fused kernel.
         weights = torch.softmax(q @ k.transpose(-1, -2) * q.shape[-1] ** -0.5, -1)
@@ -48,7 +48,10 @@ def attend(q: torch.Tensor, k: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
 
 
 class Attention(nn.Module):
-    """Multi-head attention; context (…, tokens, context_width), None: the queries' input tokens."""
+    """Attend from tokens to a context with several heads.
+
+    The context is (…, m, context_width). Without one, tokens attend to each other.
+    """
 
     def __init__(self, width: int, heads: int, context_width: int | None = None):
         super().__init__()
@@ -74,23 +77,23 @@ class Attention(nn.Module):
 
 
 class CrossDomainAttention(Attention):
-    """Star-shaped attention around color.
+    """Exchange features between color and each other domain of the same view, in the shape of a star.
 
-    Color's queries read each other domain of the same view, and one layer fuses the answers. In the two-way star the
-    other domains' queries also read color; in the one-way star they get nothing. The output projection starts at zero,
-    so a pretrained network starts unchanged.
+    Color's queries attend to each other domain, and one linear layer fuses the results. With two_way the other domains'
+    queries attend to color as well; otherwise their residual is zero. The output projection starts at zero, so the
+    layer does not change a pretrained network before it is trained.
     """
 
     def __init__(self, width: int, heads: int, two_way: bool):
         super().__init__(width, heads)
         self.two_way = two_way
-        # One layer over the concatenated answers of the other domains; a domain that is absent contributes nothing.
+        # One layer over the concatenated results of the other domains; an absent domain contributes nothing.
         self.fuse = nn.Linear((len(DOMAINS) - 1) * width, width)
         nn.init.zeros_(self.to_out[0].weight)
         nn.init.zeros_(self.to_out[0].bias)
 
     def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """Map x (b d k, t, c) to a residual of the same shape. Without color, or with color alone: zeros."""
+        """Map x (b d k, t, c) to a residual of the same shape; zeros where color or every other domain is absent."""
         others = [i for i, domain in enumerate(layout.domains) if domain != 0]
         if 0 not in layout.domains or not others:
             return torch.zeros_like(x)
@@ -111,23 +114,23 @@ class CrossDomainAttention(Attention):
         out[color] = self.to_out[0](fused)
         if self.two_way:
             keys, values = self.split(self.to_k(color_tokens)), self.split(self.to_v(color_tokens))
-            heard = attend(
+            from_color = attend(
                 self.split(self.to_q(rest)),
                 keys.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
                 values.unsqueeze(1).expand(-1, n, -1, -1, -1, -1),
             )
-            heard = self.to_out[0](self.join(heard))
+            from_color = self.to_out[0](self.join(from_color))
         else:
-            heard = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
+            from_color = torch.zeros(*shape, t, c, dtype=out[color].dtype, device=x.device)
         for j, i in enumerate(others):
-            out[i] = heard[:, j]
+            out[i] = from_color[:, j]
         return torch.stack(out, 1).flatten(0, 2)
 
 
 class JointAttention(Attention):
-    """Wonder3D's attention: the tokens of all domains of a view are one sequence.
+    """Attend across all domains of a view as one sequence of tokens, as Wonder3D does.
 
-    to_out starts without weights, so that the layer starts as (nearly) nothing.
+    The weights of to_out start at zero. Its bias does not, so the residual is small but not zero at first.
     """
 
     def __init__(self, width: int, heads: int):
@@ -143,7 +146,7 @@ class JointAttention(Attention):
 
 
 class GatedLinear(nn.Module):
-    """GEGLU (Shazeer 2020)."""
+    """Project tokens linearly, gated by a GELU of a second projection (GEGLU, Shazeer 2020)."""
 
     def __init__(self, width: int, inner: int):
         super().__init__()
@@ -156,7 +159,10 @@ class GatedLinear(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """Gated feed-forward layer of a transformer block, with diffusers' key names."""
+    """Apply the gated feed-forward layer of a transformer block, with diffusers' key names.
+
+    factor: width of the hidden layer, in units of width.
+    """
 
     def __init__(self, width: int, factor: int):
         super().__init__()
@@ -168,8 +174,10 @@ class FeedForward(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention over all views of a domain, attention across domains, attention to the image's embedding,
-    feed-forward.
+    """Attend across views, across domains and to the image's embedding, then apply a feed-forward layer.
+
+    multi_view: the tokens of all views of a domain attend to each other; otherwise those of one image. cross_domain: a
+    value of ModelConfig.cross_domain.
     """
 
     def __init__(
@@ -185,7 +193,9 @@ class TransformerBlock(nn.Module):
             self.add_module(f"attn_joint_{self.joint}", JointAttention(width, heads))
         if cross_domain in ("one_way", "two_way"):
             self.norm_cross_domain = nn.LayerNorm(width)
-            self.attn_cross_domain = CrossDomainAttention(width, heads, cross_domain == "two_way")
+            self.attn_cross_domain: CrossDomainAttention | None = CrossDomainAttention(
+                width, heads, cross_domain == "two_way"
+            )
         else:
             self.attn_cross_domain = None
         self.norm2 = nn.LayerNorm(width)
@@ -194,7 +204,7 @@ class TransformerBlock(nn.Module):
         self.ff = FeedForward(width, feed_forward)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """Map x (b d k, t, c), with context (b, m, context_width), to the same shape."""
+        """Map tokens x (b d k, t, c) and context (b, m, context_width) to tokens of x's shape."""
         images, t, c = x.shape
         groups = layout.objects * len(layout.domains)
         tokens = self.norm1(x)
@@ -213,7 +223,10 @@ class TransformerBlock(nn.Module):
 
 
 class Transformer(nn.Module):
-    """Transformer blocks over an image's features (n, c, h, w), with 1x1 projections and a residual."""
+    """Apply transformer blocks to features (n, c, h, w), between two 1x1 projections, and add the input.
+
+    side: width and height of the features for a learned position, None for no position. groups: of the group norm.
+    """
 
     def __init__(self, width: int, heads: int, context_width: int, side: int | None, groups: int, config):
         super().__init__()
@@ -226,7 +239,7 @@ class Transformer(nn.Module):
         self.proj_out = nn.Conv2d(width, width, 1)
 
     def forward(self, x: torch.Tensor, context: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """Map features x (n, c, h, w) to the same shape."""
+        """Map features x (n, c, h, w) and context (b, m, context_width) to features of x's shape."""
         n, c, h, w = x.shape
         tokens = self.proj_in(self.norm(x)).flatten(2).transpose(1, 2)
         if self.position is not None:
@@ -237,10 +250,11 @@ class Transformer(nn.Module):
 
 
 class RowAttention(nn.Module):
-    """Attention along the rows that all views of a domain share, for levels whose images are too large to attend whole.
+    """Attend along image rows through all views, on levels whose images are too large to attend to all pixels.
 
-    With orthographic cameras at one elevation a point's height is the same in every view: epipolar lines are rows
-    (Era3D, Li et al. 2024). A row costs views x side tokens, not views x side². Starts as the identity.
+    Orthographic cameras at one elevation see a point at the same height, so epipolar lines are rows (Era3D, Li et al.
+    2024). A row has views x side tokens instead of views x side². The output projection starts at zero, so the layer
+    starts as the identity.
     """
 
     def __init__(self, width: int, heads: int, side: int, groups: int):
@@ -252,7 +266,7 @@ class RowAttention(nn.Module):
         nn.init.zeros_(self.attn.to_out[0].bias)
 
     def forward(self, x: torch.Tensor, layout: Layout) -> torch.Tensor:
-        """Map x (b d k, c, h, w) to the same shape."""
+        """Map features x (b d k, c, h, w) to features of the same shape."""
         n, c, h, w = x.shape
         tokens = self.norm(x).permute(0, 2, 3, 1) + self.position.to(x.dtype)  # (n, h, w, c)
         groups = layout.objects * len(layout.domains)

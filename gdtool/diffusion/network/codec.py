@@ -1,4 +1,4 @@
-"""Convert encoded images to the latents that are denoised, and back: pixel patches, or Stable Diffusion's VAE."""
+"""Convert encoded images to the latents that the network denoises, and back: by patches, or Stable Diffusion's VAE."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CHUNK = 4  # images that go through the VAE at once: its memory does not grow wi
 
 
 class PatchCodec:
-    """Space-to-depth: a patch of p x p pixels is one latent pixel. Lossless, no weights."""
+    """Fold each patch of p x p pixels into the channels of one latent pixel. Lossless, without weights."""
 
     def __init__(self, config: ModelConfig):
         self.patch = config.patch
@@ -31,7 +31,10 @@ class PatchCodec:
         return F.pixel_unshuffle(images, self.patch)
 
     def encode_condition(self, rgba: torch.Tensor) -> torch.Tensor:
-        """Fold patches of (n, 4, h, w) into (n, condition_channels, h / p, w / p), the color's channels first."""
+        """Fold patches of rgba (n, 4, h, w) in [-1, 1] -> (n, condition_channels, h / p, w / p).
+
+        The color's channels come first; those of coverage follow where the configuration has condition_alpha.
+        """
         return F.pixel_unshuffle(rgba if self.alpha else rgba[:, :3], self.patch)
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
@@ -40,10 +43,11 @@ class PatchCodec:
 
 
 class VaeCodec:
-    """Stable Diffusion's autoencoder (diffusers), frozen: factor 8, 4 channels, the mode times the scaling factor.
+    """Encode and decode images with Stable Diffusion's frozen autoencoder (diffusers), 8 times smaller and 4 channels.
 
-    It follows its input's device and takes CHUNK images at a time. Where a gradient goes through decode(), each chunk
-    is recomputed in the backward pass, so that only one chunk's activations are held.
+    A latent is the mode of the encoder's distribution times the VAE's scaling factor. The autoencoder moves to its
+    input's device and takes CHUNK images at a time. Where a gradient goes through decode(), each chunk is computed
+    again in the backward pass, so that the activations of one chunk are held, not of all.
     """
 
     latent_channels = condition_channels = 4
@@ -67,7 +71,7 @@ class VaeCodec:
             return in_chunks(lambda x: vae.encode(x).latent_dist.mode() * vae.config.scaling_factor, images)
 
     def encode_condition(self, rgba: torch.Tensor) -> torch.Tensor:
-        """Encode the color of (n, 4, h, w)."""
+        """Encode the color of rgba (n, 4, h, w) in [-1, 1] -> (n, 4, h / 8, w / 8); coverage is left out."""
         return self.encode(rgba[:, :3])
 
     def decode(self, latents: torch.Tensor) -> torch.Tensor:
@@ -77,12 +81,15 @@ class VaeCodec:
 
 
 def in_chunks(function: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """Apply function to CHUNK rows of x at a time; with a gradient, each chunk is recomputed in the backward pass."""
+    """Apply function to CHUNK rows of x (n, …) at a time.
+
+    Where x has a gradient, each chunk is computed again in the backward pass instead of being held.
+    """
     if torch.is_grad_enabled() and x.requires_grad:
         return torch.cat([checkpoint(function, part, use_reentrant=False) for part in x.split(CHUNK)])
     return torch.cat([function(part) for part in x.split(CHUNK)])
 
 
 def make_codec(config: ModelConfig) -> PatchCodec | VaeCodec:
-    """Create the configuration's codec."""
+    """Create the codec that the configuration names."""
     return VaeCodec(config) if config.codec == "vae" else PatchCodec(config)

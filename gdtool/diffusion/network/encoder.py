@@ -14,7 +14,7 @@ from gdtool.diffusion.network.tensors import pretrained_part
 
 
 class EncoderLayer(nn.Module):
-    """Pre-norm transformer layer."""
+    """Apply a transformer layer with pre-normalisation to tokens (b, t, width)."""
 
     def __init__(self, width: int, heads: int):
         super().__init__()
@@ -29,9 +29,9 @@ class EncoderLayer(nn.Module):
 
 
 class PatchEncoder(nn.Module):
-    """Small transformer over the condition's patches, trained with the rest.
+    """Encode the condition's patches with a small transformer that is trained together with the UNet.
 
-    It runs once per object, not once per image, so depth is cheap here.
+    It runs once for each object instead of once for each image, so layers cost little here.
     """
 
     def __init__(self, config: ModelConfig):
@@ -54,10 +54,10 @@ class PatchEncoder(nn.Module):
 
 
 class ClipEncoder(nn.Module):
-    """CLIP ViT-L/14's projected embedding as one 768-wide token, frozen, as in Stable Diffusion Image Variations.
+    """Encode the condition as one 768-wide token, the projected embedding of a frozen CLIP ViT-L/14.
 
-    Image Variations' model card resizes tensors bicubically without antialiasing. Wonder3D uses CLIP's processor, with
-    it.
+    Stable Diffusion Image Variations does the same. Its model card resizes pictures bicubically without antialiasing.
+    Wonder3D resizes them with CLIP's processor, which antialiases.
     """
 
     # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
@@ -76,19 +76,19 @@ class ClipEncoder(nn.Module):
                 pretrained_part(config, "image_encoder"), use_safetensors=True
             )
         self.antialias = config.convention == "wonder3d"
-        # in a list, so that its weights are neither trained nor saved with ours
+        # in a list, so that its weights are neither trained nor saved with the model's
         self.frozen = [clip.requires_grad_(False).eval()]
 
     def forward(self, rgba):
         """Map rgba (b, 4, h, w) in [-1, 1] to one token (b, 1, 768)."""
         clip = self.frozen[0].to(rgba.device)
         image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
-        image = image.clamp(0, 1) if self.antialias else image  # as pictures of 8 bits are
+        image = image.clamp(0, 1) if self.antialias else image  # as after quantising to 8 bits
         mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
         with torch.no_grad():
             return clip((image - mean) / deviation).image_embeds.unsqueeze(1)
 
 
 def make_encoder(config: ModelConfig) -> nn.Module:
-    """Create the configuration's encoder."""
+    """Create the image encoder that the configuration names."""
     return ClipEncoder(config) if config.encoder == "clip" else PatchEncoder(config)

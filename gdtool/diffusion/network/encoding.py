@@ -1,11 +1,11 @@
-"""Domain images as what the network sees: three channels in [-1, 1], premultiplied by coverage, and back.
+"""Encode the images of each domain as the network's three channels in [-1, 1], and decode them.
 
-Every domain carries the silhouette, so that a mask comes out with whatever subset is sampled:
+Every domain carries the silhouette, so that a mask can be decoded from whatever subset is sampled:
   color, albedo        sRGB, 2c - 1, over an encoded background (white 1, grey 0, black -1)
   normal               world axes, times coverage: its length is the coverage
-  depth                linear over the object's slab, (2 - depth) / SLAB: nearer is larger; (value, value, coverage)
+  depth                (2 - depth) / SLAB in world units, so nearer is larger; (value, value, coverage)
   roughness, metallic  2v - 1; (value, value, coverage)
-In the third channel of the scalar domains coverage m is 2m - 1; values are multiplied by m, so the background is 0.
+In the third channel of the scalar domains coverage m is 2m - 1. Values are multiplied by m, so the background is 0.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ MIRRORED_VIEW = {"front_right": "front_left", "front_left": "front_right", "righ
 
 
 def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.ndarray:
-    """Convert a views folder's images (k, h, w[, 3]) and mask (k, h, w) to premultiplied planes (k, 13, h, w) in [-1,
-    1].
+    """Convert a views folder's images to premultiplied planes (k, 13, h, w) in [-1, 1], the channels of PLANES.
 
-    color and albedo linear, normal unit, depth in world units. Coverage m is stored as 2m - 1.
+    Takes images (k, h, w[, 3]) by domain and mask (k, h, w), coverage. color and albedo are linear, normal is unit,
+    depth is in world units. Values are multiplied by coverage m, which itself is stored as 2m - 1.
     """
     from gdtool.images.color import srgb_from_linear
 
@@ -61,9 +61,10 @@ def planes_from_images(images: dict[str, np.ndarray], mask: np.ndarray) -> np.nd
 
 
 def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Tensor) -> torch.Tensor:
-    """Encode planes (b, k, 13, h, w) over background (b,), encoded, to images (b, d, k, 3, h, w) in [-1, 1].
+    """Encode planes (b, k, 13, h, w) over backgrounds to images (b, d, k, 3, h, w) in [-1, 1].
 
-    domains: indices into DOMAINS.
+    planes: as planes_from_images() makes them. domains: d indices into DOMAINS. background (b,): encoded, a value of
+    BACKGROUND for each object.
     """
     mask = planes[:, :, PLANES["mask"]]
     behind = (0.5 - 0.5 * mask) * background[:, None, None, None, None]
@@ -80,12 +81,15 @@ def encode(planes: torch.Tensor, domains: tuple[int, ...], background: torch.Ten
 
 
 def mirrored_order(views: tuple[str, ...]) -> list[int]:
-    """Return, for each view, the index of the view that, flipped, shows the object mirrored about x = 0."""
+    """Return, for each view, the index of the view whose mirror image shows the object mirrored about x = 0."""
     return [views.index(MIRRORED_VIEW.get(name, name)) for name in views]
 
 
-def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
-    """Mirror encoded images (b, d, k, 3, h, w) of the objects about x = 0; its own inverse."""
+def mirror_images(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, ...]) -> torch.Tensor:
+    """Mirror encoded images (b, d, k, 3, h, w) of objects about x = 0. Applied twice, it gives the input.
+
+    domains: indices into DOMAINS along d. views: names along k.
+    """
     images = images[:, :, mirrored_order(views)].flip(-1)
     for j, i in enumerate(domains):
         if DOMAINS[i] == "normal":
@@ -94,31 +98,36 @@ def mirrored(images: torch.Tensor, domains: tuple[int, ...], views: tuple[str, .
 
 
 def encode_condition(rgba: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
-    """Put premultiplied encoded color of rgba (b, 4, h, w) over the background; coverage stays 2m - 1."""
+    """Composite the premultiplied color of rgba (b, 4, h, w) in [-1, 1] over backgrounds (b,).
+
+    Coverage stays as it is.
+    """
     behind = (0.5 - 0.5 * rgba[:, 3:]) * background[:, None, None, None]
     return torch.cat([rgba[:, :3] + behind, rgba[:, 3:]], 1)
 
 
 def coverage(images: dict[str, torch.Tensor], background: float) -> torch.Tensor:
-    """Compute the coverage (…, h, w) in [0, 1] on which the encoded domain images (…, 3, h, w) agree.
+    """Compute the coverage (…, h, w) in [0, 1] from encoded images (…, 3, h, w) by domain, as the mean over domains.
 
-    From the scalar domains where there is one, else from the normals' length, else from how far color differs from the
-    background (which fails for a subject of the background's color).
+    It is the third channel of scalar domains and the length of normals. Without any of these it is the difference of
+    color (or albedo) from the background, which fails for a subject of the background's color. background: encoded
+    value in [-1, 1].
     """
     votes = [0.5 + 0.5 * images[d][..., 2, :, :] for d in SCALARS if d in images]
     if "normal" in images:
         votes.append(images["normal"].norm(dim=-3))
     if not votes:
-        image = images.get("color", images.get("albedo"))
+        image = images["color"] if "color" in images else images["albedo"]
         votes = [(image - background).abs().amax(-3) * 2]
     return torch.stack(votes).mean(0).clamp(0, 1)
 
 
 def decode(images: dict[str, torch.Tensor], mask: torch.Tensor, background: float) -> dict[str, torch.Tensor]:
-    """Decode encoded images (…, 3, h, w) to values, divided by the mask's coverage (…, h, w).
+    """Decode encoded images (…, 3, h, w) by domain to values, divided by the mask's coverage (…, h, w) in [0, 1].
 
-    color, albedo sRGB (…, 3, h, w) in [0, 1]; normal unit; depth in world units (…, h, w); roughness, metallic (…, h,
-    w). Differentiable in images.
+    background: encoded value in [-1, 1] that color and albedo are composited over. Returns color and albedo (…, 3, h,
+    w) sRGB in [0, 1], normal (…, 3, h, w) unit, depth (…, h, w) in world units, roughness and metallic (…, h, w) in [0,
+    1]. Differentiable in images.
     """
     m = mask.clamp_min(0.1)
     out = {}

@@ -1,9 +1,9 @@
 """Grow a model to larger images: the same network over patches of proportionally more pixels.
 
 A model with the patch codec sees image_size / patch tokens a side. Twice the size with twice the patch gives as many
-tokens, so the same network at the same cost a step. Only the layers that read or write pixels change shape. Shown the
-small model's inputs, each pixel repeated to a square, the grown model predicts what the small one predicts, repeated
-likewise.
+tokens, so a step costs the same. Only the layers that read or write pixels change their shape. Let each pixel of the
+small model's inputs be repeated to a square. The grown model then predicts the small model's prediction, with each
+pixel repeated in the same way.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from gdtool.core.errors import InputError
 from gdtool.diffusion.config import ModelConfig
 
 
-def resized(config: ModelConfig, size: int) -> ModelConfig:
-    """Return the configuration at another image size (pixels), with patches that keep the number of tokens.
+def resize_config(config: ModelConfig, size: int) -> ModelConfig:
+    """Return the configuration for images of `size` pixels a side, with patches that keep the number of tokens.
 
-    Raises InputError.
+    Raises InputError for a size at which a patch has no whole number of pixels or the network cannot be built.
     """
     if size % config.image_size and config.image_size % size:
         raise InputError(
@@ -48,15 +48,16 @@ def resized(config: ModelConfig, size: int) -> ModelConfig:
         ) from None
 
 
-def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
+def grow_weights(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConfig) -> dict[str, torch.Tensor]:
     """Convert the weights of `small` to those of `large`, the same configuration at a multiple of its size.
 
-    Weights that read pixels are divided among the pixels of each square; weights that write them are repeated.
-    Unchanged where the sizes are equal. Raises InputError when the two are not the same network.
+    The weight of a pixel that is read is divided among the pixels of its square; the weight of a pixel that is written
+    is repeated. Returns tensors unchanged where the sizes are equal. Raises InputError when the networks differ in more
+    than the size.
     """
     if small.image_size == large.image_size:
         return tensors
-    if small.codec != "patch" or large.image_size % small.image_size or resized(small, large.image_size) != large:
+    if small.codec != "patch" or large.image_size % small.image_size or resize_config(small, large.image_size) != large:
         raise InputError(
             "start",
             f"is a model of {small.image_size} px that cannot be grown to {large.image_size} px",
@@ -65,16 +66,19 @@ def grown(tensors: dict[str, torch.Tensor], small: ModelConfig, large: ModelConf
         )
     factor = large.image_size // small.image_size
     out = dict(tensors)
-    out["unet.conv_in.weight"] = _squares(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2
+    out["unet.conv_in.weight"] = _repeat_pixels(tensors["unet.conv_in.weight"], 1, small.patch, factor) / factor**2
     for name in ("unet.conv_out.weight", "unet.conv_out.bias"):
-        out[name] = _squares(tensors[name], 0, small.patch, factor)
+        out[name] = _repeat_pixels(tensors[name], 0, small.patch, factor)
     if small.encoder == "patch":
         name = "encoder.embed.weight"
-        out[name] = _squares(tensors[name], 1, small.encoder_patch, factor) / factor**2
+        out[name] = _repeat_pixels(tensors[name], 1, small.encoder_patch, factor) / factor**2
     return out
 
 
-def _squares(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
-    """Repeat each pixel of patches folded into weight's dimension dim (c p², as pixel_unshuffle folds) to a square."""
+def _repeat_pixels(weight: torch.Tensor, dim: int, patch: int, factor: int) -> torch.Tensor:
+    """Repeat each pixel of a patch to factor x factor pixels, in a weight whose dimension dim holds folded patches.
+
+    That dimension has c patch² entries, in the order of torch's pixel_unshuffle.
+    """
     pixels = weight.unflatten(dim, (-1, patch, patch))
     return pixels.repeat_interleave(factor, dim + 1).repeat_interleave(factor, dim + 2).flatten(dim, dim + 2)

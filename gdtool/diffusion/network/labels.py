@@ -26,11 +26,11 @@ WONDER3D_LABEL_WIDTH = 10  # sin and cos of [elevation of the condition, elevati
 
 
 def class_labels(config: ModelConfig) -> torch.Tensor:
-    """Compute labels (domains, views, CLASS_WIDTH): sines, then cosines of the raw values.
+    """Compute labels (domains, views, CLASS_WIDTH): the sines, then the cosines of raw values.
 
-    Raw values are [elevation of the condition, elevation and azimuth of the view relative to it (radians), one-hot
-    domain]. The elevation of a photograph is not known when sampling, so it is 0 in training as well and the network
-    infers it.
+    The raw values are [elevation of the condition, elevation and azimuth of the view relative to it (radians), one-hot
+    domain]. The elevation of a photograph is not known when sampling. So it is 0 in training as well, and the network
+    infers it from the picture.
     """
     if config.convention == "wonder3d":
         return _wonder3d_labels(config)
@@ -44,7 +44,11 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
 
 
 def _wonder3d_labels(config: ModelConfig) -> torch.Tensor:
-    """Compute labels (domains, views, 10): sines, then cosines. Domains unknown to Wonder3D get the switch (0, 0)."""
+    """Compute Wonder3D's labels (domains, views, 10): the sines, then the cosines of raw values.
+
+    The raw values are [elevation of the condition, elevation, azimuth, two switches for the domain]. The switches are 0
+    for domains that Wonder3D does not have.
+    """
     raw = torch.tensor(
         [
             [[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views]

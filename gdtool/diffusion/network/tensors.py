@@ -18,10 +18,10 @@ NO_MODEL = "give a model folder that gdtool train has written"
 
 
 def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Read the tensors and metadata of a safetensors file.
+    """Read the tensors and the metadata of a safetensors file, each by name.
 
-    Raises InputError, with the cure where it does not exist, when it is no regular file, is damaged or holds NaN or
-    infinity; ResourceError when it is larger than the memory.
+    cure: the advice of the error for a file that does not exist. Raises InputError for a file that does not exist, is
+    no regular file, is damaged, or holds NaN or infinity; ResourceError for one larger than the memory.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -55,7 +55,7 @@ def read_tensors(path: Path, cure: str = NO_MODEL) -> tuple[dict[str, torch.Tens
 
 
 def pretrained_part(config: ModelConfig, part: str) -> Path:
-    """Find the folder unet, vae or image_encoder of config.pretrained, a local folder or a hub id.
+    """Find the folder of a part (unet, vae or image_encoder) in config.pretrained, a local folder or a hub id.
 
     Raises ResourceError for a hub id without huggingface_hub, InputError where the folder has no safetensors.
     """
@@ -63,8 +63,8 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
     if not list((folder / part).glob("*.safetensors")):
         if folder == Path(config.pretrained):
             read_tensors(
-                folder / part / "diffusion_pytorch_model.safetensors",  # names the pickle, or what is missing
-                f"{config.pretrained} is to hold a pipeline as diffusers saves it, with {part}/",
+                folder / part / "diffusion_pytorch_model.safetensors",  # raises, since the file is missing
+                f"{config.pretrained} must hold a pipeline as diffusers saves it, with {part}/",
             )
         revision = f" --revision {config.revision}" if config.revision else ""
         raise InputError(
@@ -77,7 +77,10 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
 
 
 def require_weights_fit(size: int, subject: object, what: str) -> None:
-    """Raise ResourceError when `size` bytes are more than all the memory that this process may have."""
+    """Raise ResourceError when `size` bytes are more than the memory that this process may use.
+
+    subject, what: the file and the quantity that the error names.
+    """
     most = memory.most_held() / memory.SHARE
     if size > most:
         raise ResourceError(

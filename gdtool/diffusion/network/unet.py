@@ -1,12 +1,13 @@
-"""Define the denoising network: Stable Diffusion's UNet, with transformers that read across views and domains.
+"""Define the denoising network: Stable Diffusion's UNet, with attention across views and domains.
 
-Key names and arithmetic are those of diffusers' UNet2DConditionModel (version 1 family). The code is not diffusers',
-because importing that takes three seconds and its blocks do not know which images belong to one object.
+Key names and arithmetic are those of diffusers' UNet2DConditionModel (version 1 family). diffusers' code is not used:
+importing it takes three seconds, and its blocks do not know which images belong to one object.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -20,7 +21,7 @@ from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 
 
 def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
-    """Embed timesteps (n,) as (n, width): cosines, then sines, frequencies 10000^(-i / (width / 2))."""
+    """Embed timesteps t (n,) as (n, width): cosines, then sines, of t times 10000^(-i / (width / 2))."""
     half = width // 2
     frequency = torch.exp(-math.log(10000.0) * torch.arange(half, device=t.device, dtype=torch.float32) / half)
     angle = t.float()[:, None] * frequency
@@ -28,7 +29,7 @@ def sinusoid(t: torch.Tensor, width: int) -> torch.Tensor:
 
 
 class Embedding(nn.Module):
-    """Two-layer embedding of timesteps or class labels."""
+    """Embed timesteps or class labels by two linear layers."""
 
     def __init__(self, inputs: int, width: int):
         super().__init__()
@@ -41,7 +42,11 @@ class Embedding(nn.Module):
 
 
 class Resnet(nn.Module):
-    """Residual block of two convolutions, modulated by the embedding."""
+    """Apply two convolutions with a residual connection, modulated by the embedding.
+
+    embedding: its width. groups: of the group norms. scale_shift: the embedding scales and shifts the features between
+    the convolutions; otherwise it is added to them.
+    """
 
     def __init__(self, inputs: int, outputs: int, embedding: int, groups: int, scale_shift: bool):
         super().__init__()
@@ -54,7 +59,7 @@ class Resnet(nn.Module):
         self.scale_shift = scale_shift
 
     def forward(self, x, embedding):
-        """Map x (n, inputs, h, w) with embedding (n, e) to (n, outputs, h, w)."""
+        """Map features x (n, inputs, h, w) and embedding (n, e) to (n, outputs, h, w)."""
         h = self.conv1(F.silu(self.norm1(x)))
         e = self.time_emb_proj(F.silu(embedding))[:, :, None, None]
         if self.scale_shift:
@@ -91,8 +96,17 @@ class Upsample(nn.Module):
 
 
 class Block(nn.Module):
-    """Residual blocks, each followed by optional row attention and an optional transformer, then an optional
-    resampling.
+    """Hold the layers of one resolution: residual blocks, row attention, transformers and a resampling.
+
+    Args:
+        inputs: channels that each residual block reads, one entry for each.
+        width: channels that each of them writes.
+        side: width and height of the features.
+        config: of the model.
+        attention: whether a transformer follows each residual block.
+        embedding: width of the time embedding.
+        rows: whether row attention follows each residual block.
+        down, up: whether the block ends by halving or doubling the resolution.
     """
 
     def __init__(
@@ -136,7 +150,7 @@ class Block(nn.Module):
 
 
 class UNet(nn.Module):
-    """Predict config.prediction for every image of an object."""
+    """Predict noise, velocity or x_0, as config.prediction says, for every image of a batch of objects."""
 
     def __init__(self, config: ModelConfig, latent_channels: int, condition_channels: int, side: int):
         super().__init__()
@@ -148,7 +162,7 @@ class UNet(nn.Module):
         self.class_embedding = Embedding(
             WONDER3D_LABEL_WIDTH if config.convention == "wonder3d" else CLASS_WIDTH, embedding
         )
-        common = {"config": config, "embedding": embedding}
+        common: dict[str, Any] = {"config": config, "embedding": embedding}
         last = len(widths) - 1
         self.down_blocks, skips, previous = nn.ModuleList(), [width0], width0
         sides = [side >> i for i in range(len(widths))]
@@ -177,7 +191,7 @@ class UNet(nn.Module):
         self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
         self.latent_channels = latent_channels
         if config.condition_skip:
-            # A gate per (domain, view) on the condition's own pixels. The front color view nearly is the condition.
+            # A gate for each (domain, view) on the condition's pixels: 1 for the front color view, which nearly is it.
             gate = torch.zeros(len(DOMAINS), len(config.views))
             gate[0, 0] = 1.0
             self.condition_gate = nn.Parameter(gate)
@@ -187,8 +201,9 @@ class UNet(nn.Module):
     def forward(self, noisy, condition, timestep, label, context, layout: Layout, view_idx=None):
         """Predict (n, c, h, w) from latents noisy (n, c, h, w) and condition (n, e, h, w).
 
-        n = layout.images in the order (object, domain, view); timestep (b,); label (n, CLASS_WIDTH); context (b, m,
-        encoder_width). The arguments are those of diffusers' UNet, hence eight of them.
+        n = layout.images, in the order (object, domain, view). timestep (b,); label (n, CLASS_WIDTH); context (b, m,
+        encoder_width); view_idx (k,): indices into the configuration's views, None for all of them. The arguments are
+        those of diffusers' UNet, hence more than seven.
         """
         per_object = len(layout.domains) * layout.views
         embedding = self.time_embedding(sinusoid(timestep, self.config.channels[0]))
@@ -218,10 +233,13 @@ class UNet(nn.Module):
         return out
 
     def _layer(self, block, j, x, embedding, context, layout):
-        """Run layer j of a block, checkpointed while training where the configuration asks for it."""
+        """Run layer j of a block.
+
+        With gradient checkpointing its activations are computed again in the backward pass instead of being held.
+        """
 
         def run(x, embedding, context):
-            """Run the layer's residual block and attentions."""
+            """Run the residual block, the row attention and the transformer of the layer."""
             x = block.resnets[j](x, embedding)
             if block.row_attentions:
                 x = block.row_attentions[j](x, layout)

@@ -9,9 +9,9 @@ import numpy as np
 
 
 def draw_curve(csv_path: Path, column: str = "loss", width: int = 640, height: int = 360) -> np.ndarray:
-    """Draw a column of the CSV over its first column, logarithmically, as (height, width, 3) uint8.
+    """Draw a column of a CSV file on a logarithmic scale, one point a row, as an image (height, width, 3) uint8.
 
-    Grey horizontal lines are powers of two, the light line single values, the dark line their running mean.
+    Grey horizontal lines are powers of two. The light line shows the values, the dark line their running mean.
     """
     with csv_path.open(newline="") as file:
         rows = list(csv.DictReader(file))

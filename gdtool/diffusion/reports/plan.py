@@ -1,8 +1,9 @@
 """Predict the cost of a training: memory and FLOPs of a step, and the time on one and on eight GPUs.
 
-Only the GPUs' figures are tabled. The network is built on PyTorch's meta device (shapes without numbers) and a step is
-run there forward and backward. FLOPs are counted by torch.utils.flop_counter, memory by following every storage. The
-VAE's encoding and decoding and CLIP are counted likewise; the shading itself is run on a few numbers.
+Nothing but the GPUs' data is taken from a table. The network is built on PyTorch's meta device, which holds shapes and
+no values, and a step is run there forward and backward. torch.utils.flop_counter counts FLOPs; memory is the sum of
+live storages. The VAE and CLIP are measured in the same way. The rendering loss is run on real numbers, since it is
+small.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import alpha_and_sigma
-from gdtool.diffusion.training.losses import LIT, LitObject, rendering_error, view_directions
+from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
-# Of the peak: what training a UNet of this size in bfloat16 commonly reaches; the one assumption here.
+# Share of the peak that training a UNet of this size in bfloat16 commonly reaches: an assumption, the only one here.
 UTILISATION = 0.35
 # Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
 BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
@@ -35,31 +36,31 @@ GB = 1e9
 
 
 class LiveBytes(TorchDispatchMode):
-    """Measure the peak of bytes held by results of operations, autograd's among them."""
+    """Measure the peak of the bytes that results of operations hold, those kept for the backward pass included."""
 
     def __init__(self):
         super().__init__()
         self.live = self.peak = 0
-        self.seen: dict[int, int] = {}
+        self.sizes: dict[int, int] = {}
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        """Run an operation and count the storages that it makes."""
+        """Run an operation and add the bytes of each storage that it allocates."""
         out = function(*args, **(kwargs or {}))
         inputs = {x.untyped_storage()._cdata for x in _tensors(args)}
         for x in _tensors(out):
             storage = x.untyped_storage()
             key, size = storage._cdata, storage.nbytes()
-            if key in inputs or key in self.seen:  # a view, or written in place
+            if key in inputs or key in self.sizes:  # a view, or written in place
                 continue
-            self.seen[key] = size
+            self.sizes[key] = size
             self.live += size
             self.peak = max(self.peak, self.live)
             weakref.finalize(storage, self._freed, key)
         return out
 
     def _freed(self, key: int) -> None:
-        """Subtract a freed storage."""
-        self.live -= self.seen.pop(key, 0)
+        """Subtract the bytes of a storage that was freed."""
+        self.live -= self.sizes.pop(key, 0)
 
 
 def _tensors(x):
@@ -73,11 +74,11 @@ def _tensors(x):
 
 @contextlib.contextmanager
 def fused_attention():
-    """Replace attention by the GPUs' fused kernel, which holds no matrix of weights."""
+    """Replace attention.attend() by the GPUs' fused kernel, which does not store the attention matrix."""
     before = attention.attend
 
     def fused(q, k, v):
-        """Attend without a matrix of weights."""
+        """Attend as attention.attend() does, by the fused kernel."""
         flat = (x.flatten(0, -4) for x in (q, k, v))
         return torch.ops.aten._scaled_dot_product_flash_attention(*flat)[0].view(*q.shape[:-1], v.shape[-1])
 
@@ -98,11 +99,20 @@ def step_cost(
     dtype=torch.bfloat16,
     device: str = "meta",
 ) -> dict[str, float]:
-    """Measure FLOPs and peak bytes beyond the weights of one forward and backward pass over so many objects.
+    """Measure the FLOPs and the peak bytes of one forward and backward pass of the network.
 
-    fused: attention as on a GPU, else as attend() computes it on this device. dtype: of the computation.
+    The bytes leave out weights and their gradients.
+
+    Args:
+        config: of the model.
+        domains: number of domains.
+        views: number of views.
+        objects: number of objects.
+        fused: whether attention uses a fused kernel, as on a GPU; otherwise it runs as attend() does on this device.
+        dtype: of weights and activations.
+        device: where the pass runs; "meta" computes no values.
     """
-    # Two passes: the counter's own record of modules keeps tensors alive that checkpointing would have freed.
+    # Two passes, since the FLOP counter keeps tensors alive that checkpointing would have freed.
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     _one_step(config, domains, views, objects, fused, dtype, device, counter)
     model = _one_step(config, domains, views, objects, fused, dtype, device, memory)
@@ -113,9 +123,9 @@ def step_cost(
 def _one_step(
     config: ModelConfig, domains: int, views: int, objects: int, fused: bool, dtype, device: str, watch
 ) -> Model:
-    """Run a forward and backward pass under `watch`; returns the model with its gradients.
+    """Run a forward and backward pass inside the context `watch`, and return the model with its gradients.
 
-    It has step_cost's parameters and one more, hence eight.
+    The other parameters are those of step_cost(), hence eight in all.
     """
     model = structure(config, device).to(dtype).train()
     layout = Layout(objects, tuple(range(len(DOMAINS)))[:domains], views)
@@ -128,7 +138,7 @@ def _one_step(
         context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
         model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
         model.alpha, model.sigma = model.alpha.to(dtype), model.sigma.to(dtype)
-    # sinusoid() computes in float32, which the weights here are not: what it gives is cast
+    # sinusoid() returns float32; the hook casts it to the weights' type
     hook = model.unet.time_embedding.register_forward_pre_hook(lambda module, args: (args[0].to(dtype),))
     with fused_attention() if fused else contextlib.nullcontext(), watch:
         if config.encoder == "patch":
@@ -140,10 +150,10 @@ def _one_step(
 
 
 def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
-    """Measure the cost of the frozen VAE and CLIP; None without diffusers.
+    """Measure the cost of the frozen VAE and CLIP; None where diffusers or transformers is not installed.
 
-    FLOPs: encode and decode per image (decode including its gradient), object for CLIP. Bytes: encode_bytes and
-    decode_bytes at once (they do not grow with the batch), weights_bytes in float32.
+    Returns FLOPs: encode and decode of an image by the VAE (decode with its gradient), object for CLIP. Returns bytes:
+    encode_bytes and decode_bytes, the peak of a call, which does not grow with the batch; weights_bytes in float32.
     """
     cost = dict.fromkeys(("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0)
     try:
@@ -151,15 +161,15 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
             codec = VaeCodec(config, frozen_part(config, "vae"))
             shape = (CHUNK, 4, codec.side, codec.side)
             images = torch.zeros(CHUNK, 3, config.image_size, config.image_size, device="meta")
-            cost["encode"], cost["encode_bytes"] = _counted(lambda: codec.encode(images))
-            cost["decode"], cost["decode_bytes"] = _counted(
+            cost["encode"], cost["encode_bytes"] = _measure_call(lambda: codec.encode(images))
+            cost["decode"], cost["decode_bytes"] = _measure_call(
                 lambda: codec.decode(torch.zeros(shape, device="meta", requires_grad=True)).sum().backward()
             )
             cost["encode"], cost["decode"] = cost["encode"] / CHUNK, cost["decode"] / CHUNK
             cost["weights_bytes"] += 4.0 * parameter_count(codec.vae)
         if config.encoder == "clip":
             clip = frozen_part(config, "image_encoder").requires_grad_(False)
-            cost["object"], _ = _counted(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
+            cost["object"], _ = _measure_call(lambda: clip(torch.zeros(1, 3, 224, 224, device="meta")))
             cost["weights_bytes"] += 4.0 * parameter_count(clip)
     except ImportError:
         return None
@@ -167,7 +177,10 @@ def frozen_cost(config: ModelConfig) -> dict[str, float] | None:
 
 
 def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
-    """Build, without numbers, the vae or image_encoder of a local config.pretrained, else Image Variations'."""
+    """Build the vae or the image_encoder on the meta device, without values.
+
+    Its structure is that of config.pretrained where this is a local folder, else that of Image Variations.
+    """
     from diffusers import AutoencoderKL
     from transformers import CLIPVisionConfig, CLIPVisionModelWithProjection
 
@@ -198,8 +211,8 @@ def frozen_part(config: ModelConfig, part: str) -> torch.nn.Module:
         )
 
 
-def _counted(call) -> tuple[float, float]:
-    """Measure FLOPs and peak bytes of a call."""
+def _measure_call(call) -> tuple[float, float]:
+    """Measure the FLOPs and the peak bytes of call(), which is run twice."""
     counter, memory = FlopCounterMode(display=False), LiveBytes()
     with counter:
         call()
@@ -209,8 +222,11 @@ def _counted(call) -> tuple[float, float]:
 
 
 def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> float:
-    """Compute the share of a step's objects that the rendering loss sees on average."""
-    lit = {DOMAINS.index(d) for d in LIT} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
+    """Compute the mean share of a step's objects, 0 to 1, to which the rendering loss applies.
+
+    domains: how many a step has; with less than all of them there is no rendering loss.
+    """
+    lit = {DOMAINS.index(d) for d in SHADED_DOMAINS} <= {DOMAINS.index(d) for d in config.domains} and domains == len(
         config.domains
     )
     if not lit or train.pbr_weight == 0:
@@ -221,11 +237,11 @@ def rendering_share(config: ModelConfig, train: TrainConfig, domains: int) -> fl
 
 
 def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
-    """Measure the peak bytes of the rendering loss of one object, its decoded images included."""
-    shape = (len(LIT), views, 3, config.image_size, config.image_size)
+    """Measure the peak bytes of one object's rendering loss, with the decoded images of `views` views."""
+    shape = (len(SHADED_DOMAINS), views, 3, config.image_size, config.image_size)
     planes = torch.ones(views, PLANES["mask"].stop, *shape[-2:])
     lights = torch.tensor([[0.0, 0, 1, 1, 1, 1, 1]]).repeat(16, 1)
-    order = {DOMAINS.index(d): j for j, d in enumerate(LIT)}
+    order = {DOMAINS.index(d): j for j, d in enumerate(SHADED_DOMAINS)}
     memory, start = LiveBytes(), torch.rand(shape)
     with memory:
         predicted = start.clone().requires_grad_()
@@ -241,9 +257,9 @@ def shading_bytes(config: ModelConfig, train: TrainConfig, views: int) -> float:
 
 
 def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
-    """Compute the bytes of one object's data in a step.
+    """Compute the bytes of one object's data in a step with so many domains and views.
 
-    These are its planes, their encoding, and the clean, noise, noisy and condition latents.
+    The data are its planes, their encoding, and the clean, noise, noisy and condition latents, in float32.
     """
     codec = structure(config).codec
     pixels, latent = config.image_size**2, codec.side**2
@@ -255,7 +271,7 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
     )
 
 
-def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
+def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
     """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
     weights = parameter_count(structure(config))
     frozen = frozen_cost(config)
@@ -295,9 +311,10 @@ def plan_of(config: ModelConfig, train: TrainConfig) -> dict:
 def phase_cost(
     config: ModelConfig, train: TrainConfig, phase: Phase, frozen: dict | None, weights: int, *, fused: bool = True
 ) -> dict:
-    """Compute FLOPs of a step of a phase, averaged over the timesteps, and its peak bytes.
+    """Compute the FLOPs of a step of a phase, averaged over the timesteps, and its peak bytes, by name.
 
-    The rendering loss applies to objects with little noise: their average number counts in FLOPs, all of them in bytes.
+    The rendering loss applies to objects with little noise: FLOPs count their mean number, bytes count every object.
+    frozen: as frozen_cost() returns it. weights: number of trained weights.
     """
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
@@ -314,7 +331,7 @@ def phase_cost(
         ("encode", "decode", "object", "encode_bytes", "decode_bytes", "weights_bytes"), 0.0
     )
     encoding = frozen_figures["encode"] * (domains * views + conditions)
-    decoding = frozen_figures["decode"] * share * len(LIT) * views
+    decoding = frozen_figures["decode"] * share * len(SHADED_DOMAINS) * views
     growing = data + network + rendering
     held = max(data + frozen_figures["encode_bytes"], growing + (frozen_figures["decode_bytes"] if share else 0.0))
     copies = weights * 2 if dtype == torch.bfloat16 else 0
@@ -333,8 +350,8 @@ def phase_cost(
     }
 
 
-def text_of(report: dict) -> str:
-    """Format the report as lines for a terminal."""
+def format_plan(report: dict) -> str:
+    """Format the report of make_plan() as lines for a terminal."""
     lines = [
         f"{report['weights'] / 1e6:.1f} million weights: {report['weights_bytes'] / GB:.2f} GB "
         "with gradients, moments and average",

@@ -1,4 +1,4 @@
-"""Record a training run: validation pictures and events on the way, the model folder's files at the end."""
+"""Record a training run: validation pictures and TensorBoard events during it, the model folder's files at its end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gdtool.diffusion.data.objects import Objects, from_bytes
 from gdtool.diffusion.inference import familiarity
 from gdtool.diffusion.network.model import parameter_count
 from gdtool.diffusion.reports.curve import draw_curve
-from gdtool.diffusion.reports.report import append_validation, card, validation
+from gdtool.diffusion.reports.report import append_validation, model_card, validation
 from gdtool.diffusion.training import distributed
 from gdtool.diffusion.training.loop import Observers, State
 from gdtool.diffusion.training.tensorboard import Events
@@ -22,30 +22,33 @@ from gdtool.images.io import write_png
 if TYPE_CHECKING:
     from gdtool.diffusion.training.worker import Order
 
-MOST_PICTURES = 4000  # objects whose pictures the usual range of a picture's figures is measured on
-PICTURES_EACH = 2  # condition images of an object that are measured
+MOST_PICTURES = 4000  # most objects whose pictures are measured for the ranges of figures
+PICTURES_EACH = 2  # most condition images of an object that are measured
 
 
 class Recorder:
-    """Write validation pictures, validation.csv and events of a run into its workspace."""
+    """Write validation pictures, validation.csv and TensorBoard events of a run into its workspace.
 
-    def __init__(self, workspace: Path, shown: Objects, precision: str, tensorboard: bool):
-        self.workspace, self.shown, self.precision = workspace, shown, precision
+    precision: of the network when it samples, "float32" or "bfloat16". tensorboard: whether to write events.
+    """
+
+    def __init__(self, workspace: Path, held_out: Objects, precision: str, tensorboard: bool):
+        self.workspace, self.held_out, self.precision = workspace, held_out, precision
         (workspace / "validation").mkdir(exist_ok=True)
         self.events = Events(workspace / "tensorboard") if tensorboard else None
 
     def validate(self, state: State) -> None:
         """Sample the held-out objects, if there are any."""
-        if not len(self.shown):
+        if not len(self.held_out):
             return
-        grid, psnr = validation(state, self.shown, self.precision)
+        grid, psnr = validation(state, self.held_out, self.precision)
         write_png(self.workspace / "validation" / f"step_{state.step:06d}.png", grid)
         append_validation(self.workspace / "validation.csv", state.step, state.seconds, psnr)
         if self.events is not None:
             self.events.picture(state.step, grid)
 
     def observers(self, out: Output) -> Observers:
-        """Return the functions that a training reports to."""
+        """Return the functions that the training loop calls to report."""
         log = {} if self.events is None else {"log": self.events.scalars}
         return Observers(validate=self.validate, warn=out.warn, progress=out.progress, **log)
 
@@ -57,7 +60,7 @@ class Recorder:
                 shutil.copyfile(file, out.path(f"tensorboard/{file.name}"))
         shutil.copyfile(self.workspace / "loss.csv", out.path("loss.csv"))
         write_png(out.path("loss.png"), draw_curve(self.workspace / "loss.csv"))
-        if len(self.shown):
+        if len(self.held_out):
             shutil.copyfile(self.workspace / "validation.csv", out.path("validation.csv"))
         for picture in sorted((self.workspace / "validation").glob("*.png")):
             shutil.copyfile(picture, out.path(f"validation/{picture.name}"))
@@ -66,7 +69,10 @@ class Recorder:
 def write_results(
     out: Output, recorder: Recorder, state: State, objects: Objects, order: Order, preset: str, ablation: str
 ) -> None:
-    """Write the model folder: averaged weights, records of the run, ranges of the pictures, card and content."""
+    """Write the model folder: averaged weights, loss curve, validation, ranges of the pictures, and model card.
+
+    Sets the content of the folder's manifest as well.
+    """
     save_model(out.path, order.model, state.average)
     recorder.copy_to(out)
     every = range(0, order.used, max(order.used // MOST_PICTURES, 1))
@@ -75,7 +81,7 @@ def write_results(
         for i in every
         for k in range(min(PICTURES_EACH, objects.conditions.shape[1]))
     )
-    familiarity.write_ranges(out.path(familiarity.FILE), familiarity.ranges(pictures))
+    familiarity.write_ranges(out.path(familiarity.RANGES_FILE), familiarity.figure_ranges(pictures))
     facts = {
         "objects": order.used,
         "steps": state.step,
@@ -87,7 +93,7 @@ def write_results(
         "processes": distributed.size(),
         "ablation": ablation,
     }
-    out.path("card.md").write_text(card(preset, order.model, order.train, facts))
+    out.path("card.md").write_text(model_card(preset, order.model, order.train, facts))
     out.content = ModelContent(
         preset=preset,
         image_size=order.model.image_size,

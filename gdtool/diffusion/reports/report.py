@@ -19,11 +19,11 @@ from gdtool.diffusion.network.encoding import BACKGROUND, encode
 
 
 def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dict[str, float]]:
-    """Sample validation objects: a picture (h, w, 3) in [0, 1] and the PSNR in dB of each domain.
+    """Sample the validation objects; returns a picture (h, w, 3) in [0, 1] and the PSNR in dB by domain.
 
-    The picture has a row per domain for each object: the condition, the true views and the sampled ones. PSNR is of the
-    encoded images (0 is grey), over all views but the front one, mean over views and objects. Sampled by the averaged
-    weights in as many steps as the model asks for, four at most.
+    The picture has, for each object, the condition on the left and a row for each domain: the true views, then the
+    sampled ones. PSNR compares encoded images, in which 0 is grey. It is the mean over objects and all views but the
+    front one. The averaged weights are used, in as many steps as the model is sampled with by default, four at most.
     """
     model, config = state.model, state.model.config
     device = next(model.parameters()).device
@@ -43,9 +43,9 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
         sampled = torch.stack([images[d][0].float().cpu() for d in config.domains])
         errors.append(((sampled - truth)[:, unseen] / 2).square().mean((2, 3, 4)))
         blocks = [_tile(truth), _tile(sampled)]
-        shown = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
-        shown[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
-        rows.append(np.concatenate([shown, *blocks], 1))
+        condition_column = np.full((blocks[0].shape[0], config.image_size, 3), 0.5, np.float32)
+        condition_column[: config.image_size] = (0.5 + 0.5 * rgba[0, :3].permute(1, 2, 0)).numpy()
+        rows.append(np.concatenate([condition_column, *blocks], 1))
     model.load_state_dict({**model.state_dict(), **current})
     model.train()
     psnr = -10 * torch.stack(errors).clamp(min=1e-10).log10().mean((0, 2))
@@ -53,25 +53,26 @@ def validation(state, objects: Objects, precision: str) -> tuple[np.ndarray, dic
 
 
 def append_validation(path: Path, step: int, seconds: float, psnr: dict[str, float]) -> None:
-    """Add a row to validation.csv; rows of this step and later ones are dropped, because a resumed run writes them
-    again.
+    """Add a row to validation.csv, with the PSNR in dB by domain.
+
+    Rows of this step and later ones are removed first, because a resumed run writes them again.
     """
     head = ["step", "seconds", *psnr]
-    kept = []
+    earlier_rows = []
     if path.is_file():
         with path.open(newline="") as file:
-            kept = [row for row in csv.DictReader(file) if int(row["step"]) < step]
+            earlier_rows = [row for row in csv.DictReader(file) if int(row["step"]) < step]
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, head)
         writer.writeheader()
-        writer.writerows(kept)
+        writer.writerows(earlier_rows)
         writer.writerow(
             {"step": step, "seconds": f"{seconds:.1f}"} | {name: f"{value:.3f}" for name, value in psnr.items()}
         )
 
 
 def _tile(images: torch.Tensor) -> np.ndarray:
-    """Arrange (d, k, 3, h, w) in [-1, 1] as a picture (d h, k w, 3) in [0, 1]."""
+    """Arrange images (d, k, 3, h, w) in [-1, 1] as one picture (d h, k w, 3) in [0, 1]."""
     d, k, c, h, w = images.shape
     return (0.5 + 0.5 * images).permute(0, 3, 1, 4, 2).reshape(d * h, k * w, c).numpy()
 
@@ -84,7 +85,7 @@ def machine() -> str:
     return f"{model or platform.processor()}, {os.cpu_count()} cores"
 
 
-def card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> str:
+def model_card(preset: str, model: ModelConfig, train: TrainConfig, facts: dict) -> str:
     """Write the model card in Markdown: purpose, training data and procedure, and the whole configuration."""
     configuration = msgspec.json.format(msgspec.json.encode({"model": model, "train": train}), indent=1).decode()
     table = "\n".join(f"| {name.replace('_', ' ')} | {value} |" for name, value in facts.items())

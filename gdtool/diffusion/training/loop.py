@@ -1,9 +1,9 @@
-"""Run the training loop: draw, add noise, predict, compare, step, average, log.
+"""Run the training loop: draw a batch, add noise, predict, compute the loss, step, average the weights, log.
 
-A run is a pure function of data, configuration and seed. Each step's choices come from (seed, step) and those of each
-of its objects from (seed, step, place in the batch), so that the split of a batch over accumulations and processes does
-not matter. A checkpoint holds the rest (weights, their average, the optimiser's moments), so that a resumed run equals
-the unbroken one bit for bit. distributed.py holds what several processes do differently.
+A run is a pure function of data, configuration and seed. The choices of a step are seeded by (seed, step), those of an
+object by (seed, step, place in the batch). So it does not matter how a batch is split over accumulations and processes.
+A checkpoint holds the rest: weights, their average and the optimiser's moments. So a resumed run equals one that was
+never stopped, bit for bit. distributed.py holds what differs between several processes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.reading import parse_json
 from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
-from gdtool.diffusion.data.objects import Batch, Objects, draw, object_order
+from gdtool.diffusion.data.objects import Batch, Objects, draw_batch, object_order
 from gdtool.diffusion.inference.sampling import precision_context
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
@@ -34,7 +34,7 @@ from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training import distributed
-from gdtool.diffusion.training.losses import LIT, LitObject, image_error, rendering_error, view_directions
+from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, image_error, rendering_error, view_directions
 from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -43,20 +43,24 @@ MOST_SKIPPED = 10  # steps in a row with a gradient that is not finite: the run 
 
 @dataclass
 class State:
-    """Hold everything that changes while training."""
+    """Hold everything that changes while training: model, optimiser, averaged weights by name, step and time."""
 
     model: Model
-    optimizer: Any  # torch.optim.Optimizer, or what is as one: optimizer.py
+    optimizer: Any  # a torch.optim.Optimizer or optimizer.MuonAndAdam
     average: dict[str, torch.Tensor]
     objective: torch.nn.Module
     step: int = 0
     seconds: float = 0.0
-    skipped: int = 0  # steps in a row
+    skipped: int = 0  # steps in a row whose gradient was not finite
 
 
 @dataclass(frozen=True)
 class Step:
-    """Hold the random choices of one step that all its objects share, and the seeds of each object's."""
+    """Hold the random choices of one step.
+
+    domains: indices into DOMAINS, and views (k,): indices into the configuration's views; both are common to all
+    objects of the batch. seed, number: of the run and of the step, which seed the choices of each object.
+    """
 
     domains: tuple[int, ...]
     views: torch.Tensor
@@ -64,7 +68,7 @@ class Step:
     number: int
 
     def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
-        """Return the generators of the object at this place of the step's batch."""
+        """Return the generators for the object at this place of the step's batch: NumPy's, and PyTorch's on the CPU."""
         choices = np.random.default_rng((self.seed, 3, self.number, place))
         return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
 
@@ -82,31 +86,37 @@ class Objective(torch.nn.Module):
 
 
 def new_state(model: Model, train: TrainConfig) -> State:
-    """Create the state before the first step; wrapped for all processes."""
+    """Create the state before the first step, with the objective wrapped for all processes."""
     objective = distributed.wrap(Objective(model, train))
     optimizer = make_optimizer(model, train)
-    average = {name: distributed.local(p).clone() for name, p in model.named_parameters()}
+    average = {name: distributed.local_part(p).clone() for name, p in model.named_parameters()}
     return State(model, optimizer, average, objective)
 
 
 def progress_of(state: State, train: TrainConfig, minutes: float | None) -> float:
-    """Return the share of the run that is over, 0…1: by steps, or by minutes where those are given and spent sooner."""
+    """Return the share of the run that is over, 0 to 1: the greater of those by steps and by minutes.
+
+    minutes: limit of the run's time, or None.
+    """
     return min(max(state.step / train.steps, state.seconds / 60 / minutes if minutes else 0.0), 1.0)
 
 
 def phase_at(progress: float, train: TrainConfig) -> Phase:
-    """Return the phase at this progress."""
+    """Return the phase of the training at a progress, 0 to 1."""
     return next((phase for phase in train.phases if progress < phase.share), train.phases[-1])
 
 
 def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
-    """Return the learning rate: warm-up, the phase's rate, and cosine decay where configured."""
+    """Compute the learning rate: the phase's rate times the warm-up, and times a cosine decay where configured."""
     rate = phase_at(progress, train).learning_rate * min((state.step + 1) / train.warmup, 1.0)
     return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
 
 
-def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
-    """Choose a step's domains and views; color always where it is primary and more than one domain is drawn."""
+def choose_step(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
+    """Choose a step's domains and views at random.
+
+    In a model with attention across domains, color is among the domains wherever there is more than one.
+    """
     choices = np.random.default_rng((seed, 2, step))
     modelled = [DOMAINS.index(d) for d in config.domains]
     if phase.domains >= len(modelled):
@@ -122,15 +132,16 @@ def choose(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
 def losses(
     model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig
 ) -> dict[str, torch.Tensor]:
-    """Compute the objective of one micro-batch and its parts by name; every figure is a mean over its objects.
+    """Compute the objective of a micro-batch of b objects, "loss", and its parts by name, each a mean over the objects.
 
-    generators: one for each object, the source of all that is random about it.
+    generators: b, one for each object. They decide its timestep, noise, background, dropped conditions and shaded
+    pixels.
     """
     config, b, device = model.config, len(batch.planes), batch.planes.device
     layout = Layout(b, step.domains, len(step.views))
     n = layout.images // b
 
-    # per object: timestep, whether it is the last one, what is dropped, background
+    # four numbers for each object: timestep, whether it is the last one, what is dropped, background
     dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
     background = torch.tensor(
         [BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device
@@ -140,7 +151,7 @@ def losses(
     clean = model.codec.encode(truth.flatten(0, 2))
     rgba = encode_condition(batch.condition, background)
 
-    # One timestep per object: sampling never sees anything else.
+    # One timestep for all images of an object, as when sampling.
     t = (dice[:, 0] * config.timesteps).long()
     t = torch.where(dice[:, 1] < train.pure_noise, config.timesteps - 1, t).to(device)
     noise = torch.cat([torch.randn(n, *clean.shape[1:], generator=generator) for generator in generators]).to(device)
@@ -157,16 +168,16 @@ def losses(
         )
         predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
 
-    counted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
+    weighted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
     weight = loss_weight(model.alpha[t], model.sigma[t], train.snr_gamma, train.snr_floor)
-    total = (weight[:, None] * counted).mean()
+    total = (weight[:, None] * weighted).mean()
     parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
 
     snr = (model.alpha[t] / model.sigma[t]).square()
     near = torch.nonzero(snr > train.pbr_snr).flatten()
     if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
-        # decoded and shaded: what light is computed from, of the objects that it is computed for
-        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in LIT]
+        # Only the domains that shading reads are decoded, and only of these objects.
+        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in SHADED_DOMAINS]
         latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
         directions = view_directions(config)[step.views].to(device)
         order = {step.domains[j]: place for place, j in enumerate(lit)}
@@ -190,16 +201,21 @@ def losses(
 def train_step(
     state: State, objects: Objects, train: TrainConfig, seed: int, minutes: float | None, device: str
 ) -> dict[str, float]:
-    """Take one optimiser step over the phase's objects in `accumulate` parts; updates state."""
+    """Take one optimiser step, and update the state.
+
+    The phase's batch is split into `accumulate` parts, one after the other. minutes: limit of the run's time, or None.
+    Returns the step's row of loss.csv. Raises InputError for a batch smaller than the number of processes.
+    """
     config, progress = state.model.config, progress_of(state, train, minutes)
     phase = phase_at(progress, train)
-    step = choose(config, phase, seed, state.step)
+    step = choose_step(config, phase, seed, state.step)
     rate = learning_rate(state, progress, train)
     for group in state.optimizer.param_groups:
         group["lr"] = rate * group["rate"]
     idx = object_order(len(objects), state.step, phase.batch or train.batch, seed)
-    places, sums = np.arange(len(idx)), {}
-    # Every process takes its share of each part of the batch; its gradients' mean is what the processes agree on.
+    places = np.arange(len(idx))
+    sums: dict[str, float] = {}
+    # Every process takes a share of each part of the batch; DDP and FSDP average the gradients over processes.
     if len(idx) < distributed.size():
         raise InputError(
             "batch",
@@ -207,10 +223,10 @@ def train_step(
             "raise --batch",
         )
     count = min(train.accumulate, len(idx) // distributed.size())
-    parts_of = [distributed.share_of(part) for part in np.array_split(places, count)]
+    parts_of = [distributed.part_for_process(part) for part in np.array_split(places, count)]
     for number, part in enumerate(parts_of):
         choices, generators = zip(*(step.choices(int(place)) for place in part), strict=True)
-        batch = draw(objects, idx[part], config, train, choices)
+        batch = draw_batch(objects, idx[part], config, train, choices)
         batch = Batch(batch.planes.to(device), batch.condition.to(device), batch.lights.to(device))
         with distributed.synchronised(state.objective, number == len(parts_of) - 1):
             parts = state.objective(batch, step, list(generators))
@@ -218,31 +234,34 @@ def train_step(
             (parts["loss"] * share * distributed.size()).backward()
         for name, value in parts.items():
             sums[name] = sums.get(name, 0.0) + float(value.detach()) * share
-    sums = distributed.total(sums)
-    norm = distributed.local(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
+    sums = distributed.sum_over_processes(sums)
+    norm = distributed.local_part(torch.nn.utils.clip_grad_norm_(state.model.parameters(), train.clip), whole=True)
     finite = bool(torch.isfinite(norm))
-    if finite:  # a step that is not finite is left out rather than the whole run lost
+    if finite:  # otherwise the step is skipped, so that the weights stay finite
         state.optimizer.step()
     state.skipped = 0 if finite else state.skipped + 1
     state.optimizer.zero_grad(set_to_none=True)
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
     names = list(state.average)
-    weights = {name: distributed.local(p) for name, p in state.model.named_parameters()}
+    weights = {name: distributed.local_part(p) for name, p in state.model.named_parameters()}
     torch._foreach_lerp_([state.average[n] for n in names], [weights[n] for n in names], 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
 
 def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
-    """Write weights, average and moments beside the old checkpoint, then replace it."""
+    """Write weights, averages and moments to a file beside the old checkpoint, then replace it.
+
+    identity: text that a resumed run must match.
+    """
     from safetensors.torch import save_file
 
     tensors = {}
     for name, p in state.model.named_parameters():
-        tensors[f"model/{name}"] = distributed.whole(p.detach())
-        tensors[f"average/{name}"] = distributed.whole(state.average[name], p)
+        tensors[f"model/{name}"] = distributed.gather(p.detach())
+        tensors[f"average/{name}"] = distributed.gather(state.average[name], p)
         for key, value in state.optimizer.state.get(p, {}).items():
-            tensors[f"{key}/{name}"] = distributed.whole(value)
+            tensors[f"{key}/{name}"] = distributed.gather(value)
     if distributed.rank() != 0:
         return
     tensors = {name: x.cpu().contiguous() for name, x in tensors.items()}
@@ -253,7 +272,10 @@ def save_checkpoint(state: State, workspace: Path, identity: str) -> None:
 
 
 def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
-    """Restore state from the workspace's checkpoint, if any. Raises InputError when it belongs to another run."""
+    """Restore the state from the workspace's checkpoint, and return whether there was one.
+
+    Raises InputError when it belongs to a run with another identity.
+    """
     path = workspace / CHECKPOINT
     if not path.is_file():
         return False
@@ -265,15 +287,15 @@ def load_checkpoint(state: State, workspace: Path, identity: str) -> bool:
         )
     with torch.no_grad():
         for name, p in state.model.named_parameters():
-            p.copy_(distributed.sharded(tensors[f"model/{name}"], p))
-            state.average[name].copy_(distributed.local(distributed.sharded(tensors[f"average/{name}"], p)))
+            p.copy_(distributed.shard_like(tensors[f"model/{name}"], p))
+            state.average[name].copy_(distributed.local_part(distributed.shard_like(tensors[f"average/{name}"], p)))
             moments = {key: tensors[f"{key}/{name}"] for key in MOMENTS if f"{key}/{name}" in tensors}
             if moments:
                 restore_moments(
                     state.optimizer,
                     p,
                     {
-                        key: value if key == "step" else distributed.sharded(value.to(p.device), p)
+                        key: value if key == "step" else distributed.shard_like(value.to(p.device), p)
                         for key, value in moments.items()
                     },
                 )
@@ -301,7 +323,11 @@ class _Record(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Set a run: seed, limit in minutes, steps between checkpoints and between validations, device."""
+    """Set how a run goes, apart from its configuration.
+
+    seed: of all random choices. minutes: limit of the time spent in steps, None for none. checkpoint_every,
+    validate_every: in steps. device: a torch device.
+    """
 
     seed: int
     minutes: float | None = None
@@ -312,7 +338,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Observers:
-    """Hold the functions that a run reports to: validation, warnings, log rows and a progress bar."""
+    """Hold the functions that the training loop calls: for validation, warnings, rows of the log, and progress."""
 
     validate: Callable[[State], None] = lambda state: None
     warn: Callable[[str], None] = lambda message: None
@@ -328,10 +354,10 @@ def run_training(
     options: RunOptions,
     observers: Observers = Observers(),
 ) -> State:
-    """Train until the steps or the minutes are spent, resuming from workspace.
+    """Train until all steps or minutes are spent, resuming from the checkpoint in workspace where there is one.
 
-    The first process writes workspace/loss.csv and passes each of its rows to log. Raises InputError when MOST_SKIPPED
-    steps in a row had a gradient that is not finite; before that it warns of each.
+    The first process writes workspace/loss.csv and passes each row to observers.log. A step whose gradient is not
+    finite is skipped with a warning. Raises InputError after MOST_SKIPPED such steps in a row.
     """
     identity = msgspec.json.encode([model.config, train, options.seed, len(objects)]).decode()
     torch.manual_seed(options.seed)
@@ -341,34 +367,36 @@ def run_training(
     log_path = workspace / "loss.csv"
     target = log_path if distributed.rank() == 0 else Path(os.devnull)
     with target.open("r+" if resumed and log_path.is_file() else "w", newline="") as file:
-        writer = _continued(file, state.step if resumed else 0, model.config.domains)
+        writer = _resume_log(file, state.step if resumed else 0, model.config.domains)
         bar = iter(observers.progress(range(state.step, train.steps), train.steps, "training"))
         while progress_of(state, train, options.minutes) < 1:
             start = time.perf_counter()
             record = train_step(state, objects, train, options.seed, options.minutes, options.device)
-            state.seconds += distributed.total({"s": time.perf_counter() - start})["s"] / distributed.size()
+            state.seconds += (
+                distributed.sum_over_processes({"s": time.perf_counter() - start})["s"] / distributed.size()
+            )
             writer.writerow(
                 {k: (f"{v:.6g}" if isinstance(v, float) else v) for k, v in record.items()}
                 | {"seconds": f"{state.seconds:.1f}"}
             )
             file.flush()
             observers.log(record)
-            _tell_skipped(state, observers.warn)
+            _warn_skipped(state, observers.warn)
             next(bar, None)
             if state.step % options.checkpoint_every == 0:
                 save_checkpoint(state, workspace, identity)
             if state.step % options.validate_every == 0:
-                whole = distributed.gathered(state)
+                whole = distributed.gather_state(state)
                 if distributed.rank() == 0:
                     observers.validate(whole)
         for _ in bar:
             break
     save_checkpoint(state, workspace, identity)
-    return distributed.gathered(state)
+    return distributed.gather_state(state)
 
 
-def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
-    """Warn of a skipped step. Raises InputError after MOST_SKIPPED in a row."""
+def _warn_skipped(state: State, warn: Callable[[str], None]) -> None:
+    """Warn where the last step was skipped. Raises InputError after MOST_SKIPPED skipped steps in a row."""
     if state.skipped >= MOST_SKIPPED:
         raise InputError(
             "training",
@@ -379,13 +407,16 @@ def _tell_skipped(state: State, warn: Callable[[str], None]) -> None:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
 
 
-def _continued(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
-    """Create a writer of the log that keeps the rows up to step; rows after a checkpoint will be written again."""
+def _resume_log(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
+    """Create a writer of loss.csv that keeps the rows up to `step`.
+
+    A resumed run starts at its checkpoint and writes the later rows again.
+    """
     columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
-    kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
+    earlier_rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)
     file.truncate() if file.name != os.devnull else None
     writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
     writer.writeheader()
-    writer.writerows(kept)
+    writer.writerows(earlier_rows)
     return writer

@@ -12,12 +12,12 @@ from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig, TrainConfig
 from gdtool.diffusion.network.encoding import PLANES, SCALARS, decode
 
-SOFTNESS = 0.02  # of the absolute error: its gradient is continuous at 0
-LIT = ("normal", "albedo", "roughness", "metallic")  # what the closed form is made of
+SMOOTHED_BELOW = 0.02  # a distance is smoothed below this, so that its gradient is continuous at 0
+SHADED_DOMAINS = ("normal", "albedo", "roughness", "metallic")  # domains that closed-form shading reads
 
 
 def linear(srgb: torch.Tensor) -> torch.Tensor:
-    """Decode sRGB, differentiably (IEC 61966-2-1)."""
+    """Decode sRGB values in [0, 1] to linear ones, differentiably (IEC 61966-2-1)."""
     high = ((srgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(srgb <= 0.04045, srgb / 12.92, high)
 
@@ -30,40 +30,41 @@ def image_error(
     config: ModelConfig,
     train: TrainConfig,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute the mean error of latents (b d k, c, h, w) per object and domain: as weighted for training, and squared,
-    (b, d).
+    """Compute the weighted and the squared error of latents (b d k, c, h, w), as means (b, d) by object and domain.
 
-    train.domain_weights apply to each domain's values; the coverage in a scalar domain's third channel weighs 1. In
-    train.absolute_domains the values count by their distance, a normal's in all three axes, smoothed below SOFTNESS
-    (Charbonnier's loss), the rest by its square. The VAE's latents have no coverage channel and are weighted as a
-    whole.
+    train.domain_weights multiply the values of each domain; the coverage in a scalar domain's third channel has weight
+    1. In the domains of train.absolute_domains the error of a value is its distance from the truth, smoothed below
+    SMOOTHED_BELOW (Charbonnier's loss); the distance of a normal is taken over its three axes. In the others the error
+    is the square of the distance. A VAE's latents have no channel of coverage and are weighted as a whole. The second
+    result is the plain squared error, without weights.
     """
     square = (predicted - clean).float().square()
     if config.codec != "patch":
         square = square.mean((1, 2, 3)).unflatten(0, (objects, len(domains), -1)).mean(2)
         return square * square.new_tensor([train.domain_weights[i] for i in domains]), square
     square = square.unflatten(1, (3, -1)).unflatten(0, (objects, len(domains), -1))  # (b, d, k, 3, patch², h, w)
-    counted = []
+    weighted = []
     for j, i in enumerate(domains):
         value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
         if DOMAINS[i] in train.absolute_domains:
-            value = ((value.mean(2, keepdim=True) + SOFTNESS**2).sqrt() - SOFTNESS).expand_as(value)
-        counted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
-    return torch.stack(counted, 1), square.flatten(2).mean(2)
+            value = ((value.mean(2, keepdim=True) + SMOOTHED_BELOW**2).sqrt() - SMOOTHED_BELOW).expand_as(value)
+        weighted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
+    return torch.stack(weighted, 1), square.flatten(2).mean(2)
 
 
 def view_directions(config: ModelConfig) -> torch.Tensor:
-    """Return unit vectors (k, 3) from the object toward each camera of the rig."""
+    """Return unit vectors (k, 3) from the object toward the camera of each view of the configuration."""
     by_name = {camera.name: camera.backward for camera in rig("six", config.image_size)}
     return torch.tensor(np.stack([by_name[name] for name in config.views]), dtype=torch.float32)
 
 
 @dataclass(frozen=True)
 class LitObject:
-    """Hold the scene of one object's rendering loss.
+    """Hold one object's silhouette, lights and cameras for the rendering loss.
 
-    planes (k, 13, h, w); lights (16, 7): axis, sharpness, amplitude; views (k, 3): toward the cameras; background:
-    encoded.
+    planes (k, 13, h, w): channels of encoding.PLANES, of which coverage is read. lights (16, 7): axis, sharpness and
+    amplitude of spherical Gaussians. views (k, 3): unit vectors toward the cameras. background: encoded value in [-1,
+    1] that the images are composited over.
     """
 
     planes: torch.Tensor
@@ -80,11 +81,11 @@ def rendering_error(
     pixels: int,
     generator: torch.Generator,
 ) -> torch.Tensor:
-    """Compute the mean squared difference of the closed-form renderings of predicted and true maps under one light.
+    """Compute the mean squared difference of predicted and true maps shaded in closed form under one light.
 
-    predicted, truth (d, k, 3, h, w): encoded images of one object. order: index into DOMAINS to position along d.
-    pixels: number of random foreground pixels. Radiance c is compared as c / (1 + c), or a few highlights would
-    dominate. float32 throughout. 0 for an object that is not seen.
+    predicted, truth (d, k, 3, h, w): encoded images of one object. order: from index into DOMAINS to position along d.
+    pixels: number of random foreground pixels that are shaded. Radiance c is compared as c / (1 + c), so that a few
+    highlights do not dominate. Computed in float32. Returns 0 for an object without foreground pixels.
     """
     from gdtool.shading.bsdf.closed_form import shade
     from gdtool.shading.bsdf.sg import SphericalGaussians
@@ -99,10 +100,10 @@ def rendering_error(
     light = SphericalGaussians(lights[:, :3], lights[:, 3], lights[:, 4:])
 
     def render(images: torch.Tensor) -> torch.Tensor:
-        """Shade the chosen pixels of images (d, k, 3, h, w)."""
+        """Shade the chosen pixels of images (d, k, 3, h, w); returns c / (1 + c) of their radiance c, (pixels, 3)."""
         picked = images[:, k, :, row, column].transpose(0, 1)  # (d, pixels, 3)
         values = decode(
-            {d: picked[order[DOMAINS.index(d)]][..., None, None] for d in LIT},
+            {d: picked[order[DOMAINS.index(d)]][..., None, None] for d in SHADED_DOMAINS},
             mask[k, row, column][:, None, None],
             scene.background,
         )

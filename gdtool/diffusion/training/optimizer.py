@@ -8,17 +8,25 @@ from gdtool.core.errors import ResourceError, UsageError
 from gdtool.diffusion.config import TrainConfig
 from gdtool.diffusion.training import distributed
 
-# What reads or writes pixels or labels is no map between features: Muon's authors leave first and last layers to AdamW.
-ENDS = ("conv_in", "conv_out", "class_embedding", "time_embedding", "position", "condition_gate", "embed")
+# Layers that read or write pixels or labels, by name. Muon's authors train first and last layers with AdamW.
+FIRST_AND_LAST_LAYERS = (
+    "conv_in",
+    "conv_out",
+    "class_embedding",
+    "time_embedding",
+    "position",
+    "condition_gate",
+    "embed",
+)
 MOMENTS = ("step", "exp_avg", "exp_avg_sq", "momentum_buffer")
-SMALLEST = 32  # rows and columns below which a matrix is left to AdamW
+MIN_MUON_SIDE = 32  # least rows and columns of a matrix that Muon trains
 
 
 class MuonAndAdam:
     """Combine torch.optim.Muon (Jordan et al. 2024) and AdamW in one optimiser.
 
-    A convolution is the matrix (outputs, inputs · taps). Muon's step is scaled to AdamW's usual size, so one learning
-    rate serves both. state maps the network's parameters to their moments, as every optimiser's does.
+    matrices: parameters that Muon trains; a convolution is the matrix (outputs, inputs · taps). rest: parameter groups
+    that AdamW trains. Muon's step is scaled to AdamW's usual size, so one learning rate serves both.
     """
 
     def __init__(self, matrices: list, rest: list[dict], train: TrainConfig):
@@ -36,7 +44,7 @@ class MuonAndAdam:
 
     @property
     def state(self) -> dict:
-        """Map parameters to moments."""
+        """Map the network's parameters to their moments, as the state of a torch optimiser does."""
         matrix_state = {
             p: self.muon.state[flat]
             for p, flat in zip(self.matrices, self.flat, strict=True)
@@ -45,7 +53,7 @@ class MuonAndAdam:
         return {**self.adam.state, **matrix_state}
 
     def restore(self, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
-        """Put back a parameter's moments."""
+        """Set a parameter's moments to those of a checkpoint."""
         for matrix, flat in zip(self.matrices, self.flat, strict=True):
             if matrix is p:
                 self.muon.state[flat] = moments
@@ -67,16 +75,18 @@ class MuonAndAdam:
 
 
 def make_optimizer(model: torch.nn.Module, train: TrainConfig):
-    """Create the configured optimiser: matrices decay, vectors do not; the class embedding has a separate learning
-    rate.
+    """Create the configured optimiser. Weight decay applies to matrices and not to vectors.
+
+    The class embedding has train.class_rate times the learning rate. Raises UsageError for Muon with weights that FSDP2
+    has split.
     """
     groups: dict[tuple[bool, float], list] = {}
     matrices = []
     for name, p in model.named_parameters():
         inner = (
             p.ndim >= 2
-            and min(p.shape[0], p[0].numel()) >= SMALLEST
-            and not any(end in name.split(".") for end in ENDS)
+            and min(p.shape[0], p[0].numel()) >= MIN_MUON_SIDE
+            and not any(end in name.split(".") for end in FIRST_AND_LAST_LAYERS)
         )
         if train.optimizer == "muon" and inner:
             matrices.append(p)
@@ -99,7 +109,7 @@ def make_optimizer(model: torch.nn.Module, train: TrainConfig):
 
 
 def restore_moments(optimizer, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
-    """Put back a parameter's moments, as they were in `optimizer.state[p]`."""
+    """Set a parameter's moments to those of a checkpoint, named as in `optimizer.state[p]`."""
     if isinstance(optimizer, MuonAndAdam):
         optimizer.restore(p, moments)
     else:

@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 
 class Events:
-    """Write event files to a folder, from the first record on. Raises ResourceError without the package tensorboard."""
+    """Write TensorBoard event files to a folder. Raises ResourceError without the package tensorboard.
+
+    The files are created at the first record.
+    """
 
     def __init__(self, folder: Path):
         try:
@@ -21,11 +24,12 @@ class Events:
             raise ResourceError(
                 "--tensorboard", "needs the package tensorboard", "pip install 'gdtool[tensorboard]', or leave it out"
             ) from None
-        self._open, self._folder, self._writer = SummaryWriter, folder, None
+        self._open, self._folder = SummaryWriter, folder
+        self._writer: SummaryWriter | None = None
 
     def _at(self, step: int):
-        """Return the writer, opened at its first step."""
-        # A resumed run goes over the steps since its checkpoint again: those of before are purged.
+        """Return the writer. The first call creates it, and hides older events of this step and later ones."""
+        # A resumed run repeats the steps since its checkpoint; purge_step hides their earlier events.
         if self._writer is None:
             self._writer = self._open(str(self._folder), purge_step=step, flush_secs=10)
         return self._writer
@@ -42,6 +46,6 @@ class Events:
         self._at(step).add_image("validation", grid, step, dataformats="HWC")
 
     def close(self) -> None:
-        """Close the files."""
+        """Close the event files."""
         if self._writer is not None:
             self._writer.close()

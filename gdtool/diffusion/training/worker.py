@@ -1,4 +1,4 @@
-"""Run a training in each of its processes: the first one's order, and the work that all do alike."""
+"""Run a training in every process: the first one sends an order, and all of them execute it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from gdtool.diffusion.training.loop import Observers, RunOptions, State, run_tra
 
 @dataclass(frozen=True)
 class Order:
-    """Tell all processes what to train.
+    """Describe a training to all processes.
 
-    start: model folder whose weights to start from, if any. used: number of objects that are trained on.
+    start: model folder whose weights the training starts from, or None. workspace: folder with the decoded objects and
+    the checkpoint. used: number of objects that are trained on; the others are for validation.
     """
 
     model: ModelConfig
@@ -31,14 +32,17 @@ class Order:
 
 
 def execute(order: Order, objects: Objects, observers: Observers | None = None) -> State:
-    """Train with the same model and data in every process, each with its part of each batch."""
+    """Train a model by the order; every process calls it with the same arguments and takes part in each batch.
+
+    observers: of the first process.
+    """
     torch.manual_seed(order.run.seed)
     model = Model(order.model)
     if order.start is not None:
-        from gdtool.diffusion.network.grow import grown
+        from gdtool.diffusion.network.grow import grow_weights
 
         loaded = load_model(order.start)
-        tensors = grown(loaded.state_dict(), loaded.config, order.model)
+        tensors = grow_weights(loaded.state_dict(), loaded.config, order.model)
         check_shapes(order.start, tensors, model.state_dict())
         model.load_state_dict(tensors)
     elif order.model.codec == "vae":
@@ -49,7 +53,10 @@ def execute(order: Order, objects: Objects, observers: Observers | None = None) 
 
 
 def follow(threads: int) -> None:
-    """Wait for the first process's order, train with it, and end: what every other process of torchrun does."""
+    """Wait for the first process's order, train by it, and end this process: the whole work of the other processes.
+
+    threads: limit of PyTorch's threads, 0 for none.
+    """
     if threads:
         torch.set_num_threads(threads)
     order = distributed.receive()

@@ -1,6 +1,8 @@
 """Evaluate the two reflection models in torch: glTF 2.0's (appendix B) and the paper's (Disney / Schlick-GGX).
 
-Cosines are clamped to [MIN_COSINE, 1]. Roughness is perceptual, α = r², and shaded with r >= MIN_ROUGHNESS.
+Cosines are tensors of one shape and lie in [-1, 1]: n_l between normal and light, n_v between normal and view, n_h and
+v_h with the half vector. They are clamped to [MIN_COSINE, 1] where a formula divides by them. Roughness is perceptual,
+α = r², and shaded with r >= MIN_ROUGHNESS.
 """
 
 from __future__ import annotations
@@ -28,7 +30,10 @@ def alpha_of(roughness: Tensor) -> Tensor:
 
 
 def f0_of(albedo: Tensor, metallic: Tensor, f0: float | Tensor) -> Tensor:
-    """Blend the reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals."""
+    """Blend the reflectance at normal incidence (..., 3): f0 for dielectrics, the albedo for metals.
+
+    albedo (..., 3) linear; metallic (...) in [0, 1]; f0 a number or (..., 1).
+    """
     m = metallic[..., None]
     return f0 * (1 - m) + albedo * m
 
@@ -50,7 +55,8 @@ def fresnel(f0: Tensor, cosine: Tensor) -> Tensor:
 def ndf(alpha: Tensor, n_h: Tensor) -> Tensor:
     """Evaluate the GGX normal distribution (Trowbridge & Reitz 1975), α² / (π ((n·h)²(α² − 1) + 1)²).
 
-    1 − (n·h)² is computed as (1 − n·h)(1 + n·h), which does not cancel near the normal.
+    alpha and the cosine n_h broadcast. 1 − (n·h)² is computed as (1 − n·h)(1 + n·h), which does not cancel near the
+    normal.
     """
     c = n_h.clamp(0.0, 1.0)
     a2 = alpha * alpha
@@ -59,7 +65,10 @@ def ndf(alpha: Tensor, n_h: Tensor) -> Tensor:
 
 
 def visibility_gltf(alpha: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
-    """Evaluate height-correlated Smith shadowing, divided by 4 (n·l)(n·v) (Heitz 2014)."""
+    """Evaluate height-correlated Smith shadowing, divided by 4 (n·l)(n·v) (Heitz 2014).
+
+    alpha, and the cosines n_l and n_v of light and view with the normal, broadcast.
+    """
     a2 = alpha * alpha
     n_l, n_v = clamp_cosine(n_l), clamp_cosine(n_v)
     root_v = torch.sqrt((1 - n_v) * (1 + n_v) * a2 + n_v * n_v)
@@ -70,7 +79,8 @@ def visibility_gltf(alpha: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
 def visibility_paper(roughness: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
     """Evaluate Schlick-GGX shadowing with k = (r + 1)² / 8, divided by 4 (n·l)(n·v).
 
-    The cosines cancel: 1 / (4 (n·l (1 − k) + k)(n·v (1 − k) + k)).
+    roughness in [0, 1], and the cosines n_l and n_v of light and view with the normal, broadcast. The cosines in
+    numerator and denominator cancel: 1 / (4 (n·l (1 − k) + k)(n·v (1 − k) + k)).
     """
     k = (roughness.clamp(MIN_ROUGHNESS, 1.0) + 1) ** 2 / 8
     n_l, n_v = clamp_cosine(n_l), clamp_cosine(n_v)
@@ -78,12 +88,16 @@ def visibility_paper(roughness: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
 
 
 def visibility(brdf: Brdf, roughness: Tensor, n_l: Tensor, n_v: Tensor) -> Tensor:
-    """Evaluate a model's shadowing term G / (4 (n·l)(n·v))."""
+    """Evaluate the shadowing term G / (4 (n·l)(n·v)) of a model; roughness and the cosines broadcast."""
     return visibility_gltf(alpha_of(roughness), n_l, n_v) if brdf == "gltf" else visibility_paper(roughness, n_l, n_v)
 
 
 def disney_diffuse(roughness: Tensor, n_l: Tensor, n_v: Tensor, l_h: Tensor) -> Tensor:
-    """Evaluate the factor on albedo / π of Disney's diffuse model (Burley 2012)."""
+    """Evaluate Disney's diffuse model (Burley 2012) as a factor on albedo / π.
+
+    roughness in [0, 1], and the cosines n_l, n_v (light, view with the normal) and l_h (light with the half vector) in
+    [0, 1], broadcast.
+    """
     f90 = 0.5 + 2 * roughness * l_h * l_h
     return (1 + (f90 - 1) * (1 - n_l) ** 5) * (1 + (f90 - 1) * (1 - n_v) ** 5)
 
@@ -99,9 +113,11 @@ def reflectance(
     n_h: Tensor,
     v_h: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Evaluate the diffuse and the specular BRDF (..., 3) at a pair of directions, without the cosine.
+    """Evaluate the diffuse and the specular BRDF (..., 3) at a pair of directions, without the cosine of the light.
 
-    f0 (..., 3) from f0_of. More than seven parameters: they are the terms of the formula, each a tensor.
+    albedo (..., 3) linear; roughness, metallic (...) in [0, 1]; f0 (..., 3) from f0_of. n_l, n_v, n_h, v_h (...):
+    cosines between normal n, light l, view v and half vector h. More than seven parameters: they are the terms of the
+    formula, each a tensor.
     """
     fresnel_term = fresnel(f0, v_h)
     specular = fresnel_term * (ndf(alpha_of(roughness), n_h) * visibility(brdf, roughness, n_l, n_v))[..., None]

@@ -1,16 +1,19 @@
-"""Shade points under spherical Gaussian light in closed form, without shadows; differentiable in everything.
+"""Shade points under spherical Gaussian light in closed form, without shadows; differentiable in every argument.
 
-Diffuse light is the clamped-cosine integral of each lobe. Specular light blends two estimates, by x = 2 λ_light r⁴ n·v:
+Diffuse light is the integral of each lobe times the clamped cosine. Specular light is a sum of two estimates, weighted
+by 1 / (1 + x) and x / (1 + x) with x = 2 λ_light r⁴ n·v:
 
-- Light that is broader than the reflection lobe: the lobe as a spherical Gaussian about the mirror direction, times the
-  light (Wang et al. 2009, "All-frequency rendering of dynamic, spatially-varying reflectance").
-- Light that is sharper: its energy times a GGX filtered by the light's width (after Tokuyoshi 2015, "Virtual spherical
-  Gaussian lights for real-time glossy indirect illumination").
+- For light that is broader than the reflection lobe: the product of the light and the lobe, which is taken as a
+  spherical Gaussian about the mirror direction (Wang et al. 2009, "All-frequency rendering of dynamic,
+  spatially-varying reflectance").
+- For light that is sharper: the light's energy times a GGX lobe that is widened by the light's width (after Tokuyoshi
+  2015, "Virtual spherical Gaussian lights for real-time glossy indirect illumination").
 """
 
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import torch
@@ -26,9 +29,9 @@ MIN_VIEW_COSINE = 0.05
 
 
 def fresnel_loss(n_v: Tensor) -> Tensor:
-    """Approximate the cosine-weighted mean of (1 − v·h)^5 over the light's hemisphere, by n·v.
+    """Approximate the mean of (1 − v·h)^5 over the hemisphere of light directions, weighted by their cosine.
 
-    A quartic in 1 − n·v, fitted to quadrature with a largest error of 1e-5.
+    n_v (...): cosine of view and normal. A quartic in 1 − n·v, fitted to quadrature; the largest error is 1e-5.
     """
     x = 1 - n_v.clamp(0.0, 1.0)
     return FRESNEL_LOSS[0] + x * (FRESNEL_LOSS[1] + x * (FRESNEL_LOSS[2] + x * (FRESNEL_LOSS[3] + x * FRESNEL_LOSS[4])))
@@ -38,7 +41,10 @@ FRESNEL_LOSS = (8.2276e-05, 2.01991e-03, 9.31524e-03, 7.78369e-03, 8.96193e-03)
 
 
 def disney_mean(roughness: Tensor, n_v: Tensor) -> Tensor:
-    """Approximate the cosine-weighted mean of Disney's diffuse factor over the light's hemisphere."""
+    """Approximate the mean of Disney's diffuse factor over the light's hemisphere, weighted by the light's cosine.
+
+    roughness (...) in [0, 1]; n_v (...): cosine of view and normal.
+    """
     # E[(1 − n·l)^5] = 1/21 and E[(l·h)²] = (1 + E[l·v]) / 2 with E[l·v] = 2/3 n·v under the cosine density.
     v = n_v.clamp(0.0, 1.0)
     f90 = 0.5 + roughness * (1 + (2 / 3) * v)
@@ -57,9 +63,10 @@ def shade(
 ) -> Tensor:
     """Compute the linear radiance (..., 3) that points reflect toward view.
 
-    normal and view (..., 3) are unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...); f0, the
-    dielectric reflectance, a number or (..., 1). A zero normal gives 0. A view below the horizon is shaded as grazing.
-    Everything broadcasts. More than seven parameters: they are the terms of the formula, each differentiable.
+    normal and view (..., 3) are unit, view toward the eye; albedo (..., 3) linear; roughness, metallic (...) in [0, 1];
+    f0, the dielectric reflectance, a number or (..., 1). A zero normal gives 0. A view below the horizon is shaded as
+    grazing. All arguments broadcast. More than seven parameters: they are the terms of the formula, each
+    differentiable.
     """
     diffuse, specular = shade_parts(normal, view, albedo, roughness, metallic, lights, brdf, f0)
     return diffuse + specular
@@ -102,10 +109,11 @@ def _specular(
     lights: SphericalGaussians,
     brdf: Brdf,
 ) -> Tensor:
-    """Compute the specular radiance (..., 3); takes what shade_parts has computed already, hence nine parameters.
+    """Compute the specular radiance (..., 3) of shade_parts.
 
-    n_v (...) clamped; f0 (..., 3) from f0_of; light_cosine and received (..., k): cosine and clamped-cosine integral of
-    each lobe.
+    n_v (...): clamped cosine of view and normal. f0 (..., 3) from f0_of. light_cosine, received (..., k): cosine with
+    the normal and clamped-cosine integral of each of k lobes. Nine parameters: shade_parts has computed some of them
+    already.
     """
     alpha = alpha_of(roughness)
     alpha2 = alpha * alpha
@@ -120,7 +128,7 @@ def _specular(
     overlap = torch.exp(exponent) * cosine_integral(sharpness, dot(axis, normal[..., None, :]))
     by_lobe = (peak * visibility(brdf, roughness, n_v, n_v))[..., None] * overlap
 
-    # The light as a point of its own width: GGX with the light's spread added, times the energy that arrives.
+    # The light as a point: GGX widened by the light's spread, times the energy that arrives.
     half = normalize(view[..., None, :] + lights.axes)
     n_h, v_h = dot(half, normal[..., None, :]), dot(half, view[..., None, :]).clamp(MIN_VIEW_COSINE, 1.0)
     spread = (1 + 1 / (v_h * v_h)) / (4 * light_sharpness.clamp_min(0.1))
@@ -140,11 +148,12 @@ def closed_form_image(
 ) -> np.ndarray:
     """Shade a view's material maps under spherical Gaussians, without shadows: (h, w, 3) linear radiance.
 
-    frame has normal, albedo, roughness, metallic and mask (h, w[, c]), as Renderer.buffers; 0 where the mask is.
+    frame: the images normal, albedo, roughness, metallic and mask (h, w[, c]) by name, as Renderer.buffers returns
+    them. Pixels whose mask is 0 are 0.
     """
     inside = frame["mask"] > 0
     view = -rays(camera)[1][inside]
-    maps = [
+    normal, toward, albedo, roughness, metallic = (
         torch.tensor(x, dtype=torch.float32)
         for x in (
             frame["normal"][inside],
@@ -153,8 +162,10 @@ def closed_form_image(
             frame["roughness"][inside],
             frame["metallic"][inside],
         )
-    ]
+    )
     out = np.zeros((*inside.shape, 3), np.float32)
     with torch.no_grad():
-        out[inside] = shade(*maps, lobes.to(torch.float32), brdf).numpy()
+        out[inside] = shade(
+            normal, toward, albedo, roughness, metallic, lobes.to(torch.float32), cast(Brdf, brdf)
+        ).numpy()
     return out

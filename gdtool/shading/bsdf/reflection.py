@@ -1,7 +1,7 @@
-"""Evaluate and sample the reflection of many surface points, several directions each.
+"""Evaluate and sample the reflection of many surface points, in several directions each.
 
-A vector per pair of point and direction is kept as three tensors, one a component: sums then run over numbers that lie
-side by side.
+The vectors of pairs of point and direction are three tensors, one for each component, so that sums run over numbers
+that are adjacent in memory.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import numpy as np
 from gdtool.shading.lights.environment import LUMINANCE
 from gdtool.shading.sampling import orthonormal_basis
 
-# The least share of sampled directions that go to the specular lobe: dull points keep some, so weights stay bounded.
+# The least share of directions that are drawn from the specular lobe; some are needed to keep weights bounded.
 MIN_SPECULAR_SHARE = 0.1
 # The least n·v that is shaded. Normal maps may turn a normal away from the eye: such points are shaded as grazing.
 MIN_VIEW_COSINE = 0.02
 
 
 def tensor_of(x: np.ndarray):
-    """Make a float32 tensor of an array."""
+    """Convert an array to a contiguous float32 tensor."""
     import torch
 
     return torch.as_tensor(np.ascontiguousarray(x), dtype=torch.float32)
 
 
 def rows_of(x: np.ndarray, part: slice = slice(None)):
-    """Make a (c, n) float32 tensor of the vectors (n, c) that part selects."""
+    """Convert the vectors x[part] of an array (m, c) to a float32 tensor (c, n), one row for each component."""
     return tensor_of(x.T[:, part])
 
 
 class PointReflection:
-    """The reflection of n points toward the eye, for k directions each.
+    """Evaluate and sample the reflection of n points toward the eye, in k directions each.
 
-    Directions are three (k, n) tensors, one a component.
+    Directions are three (k, n) tensors, one for each component.
 
     Args:
         toward: (m, 3) unit directions to the eye.
         values: attributes of the m points, as SurfaceLookup.attributes returns them.
-        part: which n of the m points are meant.
+        part: slice that selects the n points among the m.
         brdf: "gltf" or "paper" (see brdf.Brdf).
     """
 
@@ -66,13 +66,19 @@ class PointReflection:
         self.share = (reflect / (reflect + diffuse).clamp_min(1e-6)).clamp(MIN_SPECULAR_SHARE, 1.0)
 
     def offset_origins(self, position: np.ndarray, offset: float):
-        """Move positions (n, 3) by offset along the geometric normal, as starts of shadow rays: a (3, n) tensor."""
+        """Move positions (n, 3) along the geometric normal, to start shadow rays from: a (3, n) tensor.
+
+        offset: distance in world units.
+        """
         import torch
 
         return torch.from_numpy((position.T + np.float32(offset) * self.geometric.numpy()).astype(np.float32))
 
     def brightness(self, terms, luminance):
-        """Estimate the reflected luminance (k, n) of light with luminance (k, n), from the terms of evaluate."""
+        """Estimate the luminance (k, n) that is reflected of light with a luminance (k, n).
+
+        terms: the first result of evaluate().
+        """
         import torch
 
         weights = torch.from_numpy(LUMINANCE.astype(np.float32))
@@ -83,10 +89,10 @@ class PointReflection:
         """Evaluate the reflection of light from directions (x, y, z), three (k, n) tensors.
 
         Returns:
-            Four (k, n) terms: D V c, D V c w, d c / π and d c w / π. c = n·l, w = (1 − v·h)^5 is Schlick's Fresnel
-            weight, d the factor of the diffuse model.
-            The density (k, n) with which sample() draws the direction, per steradian.
-            Whether the direction (k, n) lies above the horizon of the shading normal and of the geometric one.
+            Four (k, n) terms: D V c, D V c w, d c / π and d c w / π. D is the normal distribution, V the visibility
+                term, c = n·l, w = (1 − v·h)^5 Schlick's Fresnel weight, and d the factor of the diffuse model.
+            The density (k, n), per steradian, with which sample() draws the direction.
+            Whether the direction (k, n) lies above the horizons of both the shading and the geometric normal.
         """
         from gdtool.shading.bsdf.brdf import disney_diffuse, ndf, visibility_gltf, visibility_paper
 
@@ -117,10 +123,10 @@ class PointReflection:
         return (specular, specular * w, diffuse, diffuse * w), density, above
 
     def sample(self, u, v, pick):
-        """Draw directions, three (k, n) tensors, from uniform numbers u, v and pick (k, n).
+        """Draw directions, three (k, n) tensors, from uniform numbers u, v and pick (k, n) in [0, 1).
 
-        Where pick is below the specular share, the view is mirrored at a visible normal (spherical caps, Dupuy &
-        Benyoub 2023); elsewhere the direction is cosine-weighted.
+        Where pick is below the share of the specular lobe, the view is mirrored at a random visible normal (spherical
+        caps, Dupuy & Benyoub 2023). Elsewhere the direction has a cosine-weighted density.
         """
         import torch
 

@@ -1,6 +1,7 @@
-"""Spherical Gaussians G(v) = μ exp(λ(v·p − 1)) in forms that keep float32's accuracy at every sharpness.
+"""Evaluate, multiply and integrate spherical Gaussians G(v) = μ exp(λ(v·p − 1)), accurately in float32.
 
-All functions take torch tensors that broadcast, in float32 or float64, and have finite gradients.
+A lobe has a unit axis p, a sharpness λ >= 0 and an amplitude μ. All functions take torch tensors that broadcast, in
+float32 or float64, and have finite gradients.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ _TINY = 1e-24
 
 @dataclass(frozen=True)
 class SphericalGaussians:
-    """A sum of lobes: axes (k, 3) unit, sharpness (k,) >= 0, amplitudes (k, 3) linear radiance."""
+    """Hold a sum of k lobes: axes (k, 3) unit, sharpness (k,) >= 0, amplitudes (k, 3) linear radiance."""
 
     axes: Tensor
     sharpness: Tensor
     amplitudes: Tensor
 
     def to(self, *args, **kwargs) -> SphericalGaussians:
-        """Move or cast all parts, as Tensor.to."""
+        """Move or cast all tensors, with the arguments of Tensor.to."""
         return SphericalGaussians(
             self.axes.to(*args, **kwargs), self.sharpness.to(*args, **kwargs), self.amplitudes.to(*args, **kwargs)
         )
@@ -38,23 +39,26 @@ class SphericalGaussians:
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Take the dot product over the last axis."""
+    """Take the dot product of vectors over the last axis."""
     return (a * b).sum(-1)
 
 
 def normalize(v: Tensor) -> Tensor:
-    """Divide v by its length; vectors shorter than 1e-12 stay short, with a finite gradient."""
+    """Divide vectors (..., 3) by their length. A vector shorter than 1e-12 stays short, with a finite gradient."""
     return v * torch.rsqrt(dot(v, v).clamp_min(_TINY))[..., None]
 
 
 def lobe(axis: Tensor, sharpness: Tensor, v: Tensor) -> Tensor:
-    """Evaluate a lobe as exp(−λ |v − p|² / 2): exact near the axis, where λ(v·p − 1) cancels."""
+    """Evaluate a lobe of amplitude 1 in unit directions v (..., 3), as exp(−λ |v − p|² / 2).
+
+    This form is exact near the axis, where λ(v·p − 1) would cancel.
+    """
     chord = v - axis
     return torch.exp(-0.5 * sharpness * dot(chord, chord))
 
 
 def evaluate(g: SphericalGaussians, v: Tensor) -> Tensor:
-    """Evaluate the radiance (..., 3) from directions v (..., 3)."""
+    """Evaluate the radiance (..., 3) of a sum of lobes in unit directions v (..., 3)."""
     return lobe(g.axes, g.sharpness, v[..., None, :]) @ g.amplitudes
 
 

@@ -11,7 +11,7 @@ from gdtool.shading.lights.environment import Environment
 from gdtool.shading.sampling import fibonacci
 
 BUNDLED = ("dark", "mid", "bright")
-COUNT = 16  # lobes of a fitted or random light, as in the paper
+LOBE_COUNT = 16  # lobes of a fitted or random light, as in the paper
 
 
 def direction(azimuth: float, elevation: float) -> np.ndarray:
@@ -21,8 +21,10 @@ def direction(azimuth: float, elevation: float) -> np.ndarray:
 
 
 class Softbox(NamedTuple):
-    """A rectangular lamp: its middle in degrees, half width and half height in radians, edge softness as the tangent of
-    the angle over which it fades, linear radiance.
+    """Describe a rectangular lamp in the sky.
+
+    azimuth, elevation: its middle, in degrees. half_width, half_height: in radians. softness: tangent of the angle over
+    which its edge fades out. color: linear radiance.
     """
 
     azimuth: float
@@ -34,7 +36,7 @@ class Softbox(NamedTuple):
 
 
 def _add_softboxes(image: np.ndarray, directions: np.ndarray, boxes: list[Softbox]) -> None:
-    """Add softboxes to image (h, w, 3) in place; directions (h, w, 3) of its pixels."""
+    """Add softboxes to a radiance image (h, w, 3) in place; directions (h, w, 3) are those of its pixels."""
     for box in boxes:
         forward = direction(box.azimuth, box.elevation)
         right = np.cross((0.0, 1.0, 0.0), forward)
@@ -123,8 +125,13 @@ def random_lobes(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.n
     )
 
 
-def paint(axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = "") -> Environment:
-    """Evaluate lobes into a lat-long image of that height."""
+def rasterise_lobes(
+    axes: np.ndarray, sharpness: np.ndarray, amplitudes: np.ndarray, height: int, name: str = ""
+) -> Environment:
+    """Evaluate k lobes at the pixels of a lat-long image of height rows and 2 height columns.
+
+    axes (k, 3) unit, sharpness (k,), amplitudes (k, 3) linear radiance.
+    """
     d = Environment(np.zeros((height, 2 * height, 3))).directions
     image = np.zeros_like(d)
     for axis, s, amplitude in zip(axes, sharpness, amplitudes, strict=True):

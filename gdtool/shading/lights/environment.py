@@ -1,8 +1,8 @@
 """Hold, sample and meter environment lights: lat-long images of distant radiance.
 
-A lat-long image (h, w, 3) holds linear radiance; row 0 is straight up (+Y). Column u = 0.5 + atan2(z, x) / 2π of the
-width, as three.js reads them: the middle of the image is +X, three quarters across is +Z. Radiance is constant over a
-pixel, so that importance sampling and lookup agree exactly.
+A lat-long image (h, w, 3) holds linear radiance. Row 0 is straight up (+Y). A direction (x, y, z) is at column (0.5 +
+atan2(z, x) / 2π) w, as in three.js: the middle of the image is +X, three quarters across is +Z. Radiance is constant
+over a pixel, so that importance sampling and lookup agree exactly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ METERED_WHITE = 0.8
 
 @dataclass(frozen=True)
 class Environment:
-    """A lat-long image (h, w, 3) of linear radiance >= 0; scale is the factor on the file's radiance."""
+    """Hold a lat-long image (h, w, 3) of linear radiance >= 0.
+
+    name: a bundled light's, or the file's. scale: factor between the file's radiance and the image's.
+    """
 
     image: np.ndarray
     name: str = ""
@@ -29,14 +32,14 @@ class Environment:
 
     @cached_property
     def solid_angles(self) -> np.ndarray:
-        """Solid angle in steradians of one pixel of each row, (h,), exact."""
+        """Compute the exact solid angle (h,), in steradians, of a pixel of each row."""
         height, width = self.image.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         return (edges[:-1] - edges[1:]) * (2 * np.pi / width)
 
     @cached_property
     def directions(self) -> np.ndarray:
-        """Unit directions (h, w, 3) of the pixels' centres, halfway in solid angle."""
+        """Compute the unit directions (h, w, 3) of the pixels' centres, each halving its pixel's solid angle."""
         height, width = self.image.shape[:2]
         edges = np.cos(np.linspace(0, np.pi, height + 1))
         y = 0.5 * (edges[:-1] + edges[1:])[:, None]
@@ -46,21 +49,24 @@ class Environment:
 
     @cached_property
     def pdf(self) -> np.ndarray:
-        """Density (h, w) of sample() per steradian: proportional to the brightest channel, with a small floor."""
+        """Compute the density (h, w), per steradian, with which sample() draws a pixel's directions.
+
+        It is proportional to the brightest channel, with a small floor, and uniform for an environment without light.
+        """
         value = self.image.max(-1) + 1e-4 * float(self.image.max(initial=0))
         mass = value * self.solid_angles[:, None]
         total = float(mass.sum())
         return value / total if total > 0 else np.full(value.shape, 1 / (4 * np.pi))
 
     def pixel_of(self, directions: np.ndarray) -> np.ndarray:
-        """Find the flat pixel index (n,) of unit directions (n, 3)."""
+        """Find the flat index (n,) of the pixels that unit directions (n, 3) fall into."""
         height, width = self.image.shape[:2]
         row = np.arccos(np.clip(directions[:, 1], -1, 1)) * (height / np.pi)
         column = (np.arctan2(directions[:, 2], directions[:, 0]) * (0.5 / np.pi) + 0.5) * width
         return np.minimum(row.astype(np.int64), height - 1) * width + np.minimum(column.astype(np.int64), width - 1)
 
     def radiance(self, directions: np.ndarray) -> np.ndarray:
-        """Look the radiance (n, 3) of unit directions (n, 3) up."""
+        """Look up the radiance (n, 3) from unit directions (n, 3)."""
         return self.image.reshape(-1, 3)[self.pixel_of(directions)]
 
     def sample(self, uniform: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -92,8 +98,11 @@ class Environment:
         directions = np.stack([ring * np.cos(phi), y, ring * np.sin(phi)], 1)
         return directions, self.image[row, column], self.pdf[row, column]
 
-    def shrunk(self, height: int) -> Environment:
-        """Halve the resolution while there are 2 * height rows; averages by solid angle keep the energy."""
+    def downsampled(self, height: int) -> Environment:
+        """Halve the resolution while there are at least 2 * height rows, and both sides are even.
+
+        Averages are weighted by solid angle, so the energy stays the same.
+        """
         current = self
         while current.image.shape[0] >= 2 * height and not any(side % 2 for side in current.image.shape[:2]):
             weight = current.solid_angles
@@ -103,25 +112,26 @@ class Environment:
             current = replace(self, image=rows[:, 0::2] + rows[:, 1::2])
         return current
 
-    def cut(self, height: int) -> Environment:
-        """Repeat pixels until there are at least height rows.
+    def subdivided(self, height: int) -> Environment:
+        """Divide pixels into equal ones until there are at least `height` rows and 2 * height columns.
 
-        A sum that evaluates pixels at their centres errs by 1.6 % with 8 rows, by 0.02 % with 64.
+        A sum that evaluates the cosine at pixel centres errs by 1.6 % with 8 rows, by 0.02 % with 64.
         """
         times = max(-(-height // self.image.shape[0]), 1)
         across = max(-(-2 * height // self.image.shape[1]), 1)
         return self if times == across == 1 else replace(self, image=self.image.repeat(times, 0).repeat(across, 1))
 
     def irradiance(self, normals: np.ndarray) -> np.ndarray:
-        """Integrate L max(0, n·l) dl for unit normals (n, 3), over the pixels of a copy of 32 rows: (n, 3)."""
-        small = self.shrunk(32).cut(32)
+        """Integrate L max(0, n·l) dl for unit normals (n, 3): (n, 3). The sum runs over a copy with about 32 rows."""
+        small = self.downsampled(32).subdivided(32)
         weighted = (small.image * small.solid_angles[:, None, None]).reshape(-1, 3)
         return np.maximum(normals @ small.directions.reshape(-1, 3).T, 0) @ weighted
 
     def metered(self) -> Environment:
-        """Scale the light so that a white card, albedo 0.8, turned toward most light has radiance METERED_WHITE.
+        """Scale the light so that a white surface of albedo 0.8 reflects at most the luminance METERED_WHITE.
 
-        Metering the light instead of the picture keeps a black object black.
+        The surface is turned toward the brightest of 288 directions. The light is metered and not the picture, so that
+        a black object stays black.
         """
         around = Environment(np.zeros((12, 24, 3))).directions.reshape(-1, 3)
         brightest = float((self.irradiance(around) @ LUMINANCE).max()) * 0.8 / np.pi

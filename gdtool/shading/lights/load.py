@@ -20,8 +20,8 @@ HELD_PER_PIXEL = 80
 def load_environment(source: str | Path) -> Environment:
     """Load a bundled light by its name (dark, mid, bright), or a lat-long .hdr or .exr image.
 
-    Alpha is ignored. Negative radiance, which some tools leave behind, counts as 0. Raises InputError for a file that
-    is no such image, and ResourceError for one that does not fit into memory.
+    Alpha is ignored. Negative radiance, which some tools write, counts as 0. Raises InputError for a file that is no
+    such image, and ResourceError for one that does not fit into memory.
     """
     if str(source) in BUNDLED:
         return bundled(str(source))

@@ -1,7 +1,7 @@
-"""Average an environment in advance: over growing solid angles, over the hemisphere, and over reflection lobes.
+"""Average an environment in advance: over solid angles, over the hemisphere, and over reflection lobes.
 
 Images of directions use the equal-area octahedral map (Clarberg 2008, "Fast equal-area mapping of the (hemi)sphere
-using SIMD"), pole up. Every texel has the same solid angle, so halving the image averages exactly.
+using SIMD"), with +Y in the middle. Every texel has the same solid angle, so halving an image averages exactly.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from gdtool.shading.lights.environment import Environment
 
 
 class RoughnessLevel(NamedTuple):
-    """A roughness that the light is prefiltered for.
+    """Describe a prefiltered image of the light for one roughness.
 
-    side: of the prefiltered image; broad lobes vary slowly and need few texels. light_side: of the light's image, all
-    texels of which are summed; 0 samples the lobe instead.
+    side: of the image in texels; broad lobes vary slowly and need few. light_side: texels a side of the light's image
+    over which the lobe is summed; 0 draws samples from the lobe instead.
     """
 
     roughness: float
@@ -41,9 +41,9 @@ ROUGHNESS_LEVELS = (
 )
 # Half vectors drawn from a lobe, where it is sampled.
 LOBE_SAMPLES = 64
-# Normals that are summed for at once: the matrices between the products stay in the cache.
+# Normals of one matrix product, few enough that intermediate matrices stay in the cache.
 NORMALS_AT_ONCE = 64
-# Rows and columns of the table of a lobe's share of light.
+# Rows and columns of lobe_table().
 TABLE_SIDE = 32
 
 
@@ -74,7 +74,7 @@ def octahedral_directions(side: int) -> np.ndarray:
 
 
 class LightPyramid:
-    """Hold an environment's mean radiance over solid angles of 4, 16, 64, … texels, as a mip pyramid."""
+    """Hold an environment's mean radiance over solid angles of 1, 4, 16, … texels: a pyramid of octahedral images."""
 
     def __init__(self, environment: Environment):
         import torch
@@ -108,9 +108,10 @@ class LightPyramid:
         self.texel_angle = 4 * math.pi / self.side**2
 
     def mean(self, x, y, z, solid_angle):
-        """Read the mean radiance (3, k, n) toward directions (k, n), over about a solid angle (k, 1) in steradians.
+        """Read the mean radiance (3, k, n) around directions x, y, z (k, n).
 
-        The nearest texel is read, of the coarsest level whose texels are no larger than solid_angle.
+        solid_angle (k, 1), in steradians: what to average over. The nearest texel is read, on the coarsest level whose
+        texels are no larger than solid_angle.
         """
         level = (0.5 * (solid_angle * (1 / self.texel_angle)).log2()).long().clamp(0, self.depth - 1)
         side = self.side >> level
@@ -128,8 +129,8 @@ class IrradianceMap:
     def __init__(self, environment: Environment, height: int = 48):
         import torch
 
-        small = environment.shrunk(64).cut(64)
-        # The first and last row are the poles: rows that begin half a step away are 0.7 % off there under a studio.
+        small = environment.downsampled(64).subdivided(64)
+        # The first and last row are the poles: with rows that begin half a step away, they err by 0.7 % under a studio.
         theta = np.arange(height) / (height - 1) * np.pi
         phi = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
         ring = np.sin(theta)[:, None]
@@ -163,12 +164,13 @@ class IrradianceMap:
 
 
 class Prefiltered:
-    """Look the specular reflection of an environment up, as a product of two tables.
+    """Look up the specular reflection of an environment as a product of two tables.
 
-    One is the light averaged over the lobe as seen along the normal, an image for each of ROUGHNESS_LEVELS, made when
-    first needed. The other is the lobe's share of light by angle and roughness. This is the split sum of Karis 2013
-    ("Real shading in Unreal Engine 4"). The lobe's middle is turned toward the normal, as that of rough lobes is
-    (Lagarde & de Rousiers 2014, "Moving Frostbite to PBR").
+    The first is the light averaged over the reflection lobe seen along the normal: an image for each of
+    ROUGHNESS_LEVELS, made when first needed. The second is the share of light that the lobe reflects, by n·v and
+    roughness. This is the split sum of Karis 2013 ("Real shading in Unreal Engine 4"). The first table is read in a
+    direction between the mirror direction and the normal, since rough lobes lean that way (Lagarde & de Rousiers 2014,
+    "Moving Frostbite to PBR").
     """
 
     def __init__(self, pyramid: LightPyramid, brdf: str = "gltf"):
@@ -179,7 +181,10 @@ class Prefiltered:
         self.table = lobe_table(brdf)
 
     def specular(self, normal, view, roughness):
-        """Return two (3, n) tensors a, b: reflected light is f0 a + (1 − f0) b. normal, view (3, n) unit."""
+        """Return two (3, n) tensors a, b such that the reflected light is f0 a + (1 − f0) b.
+
+        normal, view (3, n): unit vectors. roughness (n,) in [0, 1].
+        """
         import torch
 
         n_v = (normal * view).sum(0)
@@ -201,7 +206,10 @@ class Prefiltered:
         return light * share[0], light * share[1]
 
     def prepare(self, roughness: np.ndarray) -> None:
-        """Make the images that roughness (n,) needs, first those that no other thread is making."""
+        """Make the prefiltered images that roughness (n,) needs.
+
+        Images that another thread is making at the moment come last, so that threads share the work.
+        """
         import torch
 
         needed = torch.unique(torch.cat(_levels(torch.as_tensor(roughness))[:2])).tolist()
@@ -209,29 +217,30 @@ class Prefiltered:
             self._image(level)
 
     def _image(self, level: int):
-        """Return the image of a level, and make it first where needed; threads wait for one that is being made."""
+        """Return the prefiltered image of a level. The first call makes it; other threads wait for it."""
         with self.locks[level]:
             if level not in self.images:
-                begun = time.perf_counter()
+                started = time.perf_counter()
                 self.images[level] = filtered_light(self.pyramid, *ROUGHNESS_LEVELS[level])
-                self.seconds += time.perf_counter() - begun
+                self.seconds += time.perf_counter() - started
         return self.images[level]
 
 
 def lobe_roughness(roughness, n_v):
-    """Convert roughness (n,) seen at cosine n_v (n,) to that of an equally wide lobe seen along the normal.
+    """Convert roughness (n,) seen at cosine n_v (n,) to that of a lobe of equal solid angle, seen along the normal.
 
-    Tilting the half vector moves the reflection twice as far in the plane of view and normal, and n·v times that across
-    it. So the lobe's solid angle shrinks by n·v, α by its root, and roughness by its fourth root. Measured on a
-    normal-mapped glossy metal under a studio: 28.7 dB inside the outline with it, 26.8 without.
+    A tilt of the half vector moves the reflected direction by twice the tilt in the plane of view and normal, and by
+    n·v times that across the plane. So the lobe's solid angle shrinks by n·v, α by its root, and roughness by its
+    fourth root. Measured on a normal-mapped glossy metal under a studio: 28.7 dB inside the outline with it, 26.8
+    without.
     """
     return roughness * n_v.clamp(0.05, 1) ** 0.25
 
 
 def _levels(roughness):
-    """Find the levels below and above roughness (n,), and the fraction of the way between them.
+    """Find the indices of the roughness levels below and above roughness (n,), and the fraction (n,) between them.
 
-    Both are the same where roughness is exactly a level's.
+    Both indices are the same where roughness is exactly a level's.
     """
     import torch
 
@@ -244,10 +253,10 @@ def _levels(roughness):
 
 
 def filtered_light(pyramid: LightPyramid, roughness: float, side: int, light_side: int):
-    """Average the light over the GGX lobe seen along its normal, weighted by the cosine, for each direction.
+    """Average the light over the GGX lobe seen along its normal, weighted by the cosine, for every normal of an image.
 
-    side, light_side: as of RoughnessLevel. Returns an octahedral image (3, side + 2, side + 2) with a border that wraps
-    around, so that bilinear lookups need no special case.
+    side: of the image in texels. light_side: see RoughnessLevel. Returns an octahedral image (3, side + 2, side + 2);
+    its border repeats the texels across the octahedron's edges, so that bilinear lookups need no special case.
     """
     import torch
 
@@ -256,14 +265,17 @@ def filtered_light(pyramid: LightPyramid, roughness: float, side: int, light_sid
     image = (
         _sum_all_texels(pyramid, normal, a2, light_side) if light_side else _sum_lobe_samples(pyramid, normal, a2)
     ).reshape(side, side, 3)
-    # Beyond an edge of the octahedron lies the same edge in reverse order.
+    # Beyond an edge of the octahedral map, the same edge follows in reverse order.
     rows = torch.cat([image[:1].flip(1), image, image[-1:].flip(1)])
     columns = torch.cat([rows[:, :1].flip(0), rows, rows[:, -1:].flip(0)], 1)
     return columns.permute(2, 0, 1).contiguous()
 
 
 def _sum_all_texels(pyramid: LightPyramid, normal, a2: float, light_side: int):
-    """Average (n, 3) over all texels of the pyramid's level of that side, or of its finest; a2 = α²."""
+    """Average the light for normals (n, 3), weighted by the lobe, over all texels of a level of the pyramid: (n, 3).
+
+    a2: α². light_side: texels a side of the level; the finest level is taken where none is as large.
+    """
     import torch
 
     level = max(0, (pyramid.side // light_side).bit_length() - 1)
@@ -280,10 +292,10 @@ def _sum_all_texels(pyramid: LightPyramid, normal, a2: float, light_side: int):
 
 
 def _sum_lobe_samples(pyramid: LightPyramid, normal, a2: float):
-    """Average (n, 3) over half vectors drawn from the lobe; a2 = α².
+    """Average the light for normals (n, 3) over LOBE_SAMPLES directions drawn from the lobe: (n, 3).
 
-    Each reads the pyramid over twice the solid angle that it stands for, so that neighbours overlap (after Křivánek &
-    Colbert 2008, "Real-time shading with filtered importance sampling").
+    a2: α². The pyramid is read over twice the solid angle that a sample stands for, so that samples overlap (after
+    Křivánek & Colbert 2008, "Real-time shading with filtered importance sampling").
     """
     import torch
 
@@ -315,7 +327,7 @@ def _sum_lobe_samples(pyramid: LightPyramid, normal, a2: float):
 
 
 def read_octahedral(image, x, y, z):
-    """Interpolate an image of filtered_light bilinearly at unit directions: (3, n)."""
+    """Interpolate an octahedral image of filtered_light bilinearly at unit directions x, y, z (n,): (3, n)."""
     side = image.shape[1] - 2
     s, t = octahedral(x, y, z)
     return _bilinear(image, t * side + 0.5, s * side + 0.5)
@@ -336,9 +348,10 @@ def _bilinear(image, row, column):
 
 
 def lobe_table(brdf: str = "gltf", samples: int = 256):
-    """Integrate D V c dl with Fresnel 1, and with (1 − v·h)^5, for a grid of n·v and roughness.
+    """Tabulate the share of light that the specular lobe reflects, by n·v and roughness: (2, TABLE_SIDE, TABLE_SIDE).
 
-    Returns (2, TABLE_SIDE, TABLE_SIDE), by sampling visible normals.
+    The first table is the integral of D V (n·l) over light directions, the second that of D V (n·l) (1 − v·h)^5. Both
+    are means over `samples` directions that are drawn from the lobe's visible normals.
     """
     import torch
 

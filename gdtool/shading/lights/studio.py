@@ -9,7 +9,7 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.reading import MAX_INTEGER_DIGITS
 from gdtool.shading.bsdf.sg import SphericalGaussians
-from gdtool.shading.lights.bundled import paint, random_lobes
+from gdtool.shading.lights.bundled import random_lobes, rasterise_lobes
 from gdtool.shading.lights.environment import Environment
 from gdtool.shading.lights.load import load_environment
 from gdtool.shading.lights.sg_fit import fit_error, fit_sg
@@ -21,12 +21,12 @@ RANDOM_HEIGHT = 64
 def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, SphericalGaussians, dict[str, Any]]:
     """Prepare the light that source names: random:NUMBER, a bundled light, or a lat-long file.
 
-    A random studio is made of lobes: nothing is fitted, and the error is that of its pixels. Without fit, other lights
-    have no lobes and an empty error. seed: of the fit.
+    A random light is made of lobes, so nothing is fitted; its error is that of the image made from them. seed: of the
+    fit. fit: whether to fit lobes to other lights; otherwise these have no lobes and no error.
 
     Returns:
-        The metered environment, its lobes, and the record of light.json. Raises InputError for a source that is none
-        of these.
+        The metered environment, its lobes, and the record that light.json stores. Raises InputError for a source that
+            is none of these.
     """
     import torch
 
@@ -39,7 +39,7 @@ def studio(source: str, seed: int = 0, fit: bool = True) -> tuple[Environment, S
                 f"write random: and a whole number of at most {MAX_INTEGER_DIGITS} digits, as in random:7",
             )
         axes, sharpness, amplitudes = random_lobes(np.random.default_rng(int(number)))
-        environment = paint(axes, sharpness, amplitudes, RANDOM_HEIGHT, source).metered()
+        environment = rasterise_lobes(axes, sharpness, amplitudes, RANDOM_HEIGHT, source).metered()
         lobes = SphericalGaussians(
             *(torch.tensor(x, dtype=torch.float64) for x in (axes, sharpness, amplitudes * environment.scale))
         )

@@ -1,4 +1,4 @@
-"""Render the lit color of a scene from one camera: the renderer and the light together."""
+"""Render the lit color of a scene from one camera: set up the renderer and the light, and render."""
 
 from __future__ import annotations
 
@@ -20,7 +20,11 @@ def render_color(
     seed: int = 0,
     brdf: str = "gltf",
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render direct light with shadows: color (h, w, 3) linear radiance, and mask (h, w) coverage."""
+    """Render direct light with shadows: color (h, w, 3) linear radiance, and mask (h, w) coverage in [0, 1].
+
+    samples: the most samples of a pixel. light_samples: directions that a point draws from the light, and as many from
+    its reflection. brdf: "gltf" or "paper".
+    """
     renderer = Renderer(scene)
     light = DirectLight(renderer, environment, light_samples, seed, brdf)
     images = renderer.buffers(camera, samples, light.color())

@@ -26,7 +26,7 @@ from gdtool.shading.render.placement import seed_of
 from gdtool.shading.render.render import Renderer
 from gdtool.shading.render.rigs import condition_camera
 
-# The least share of its area on which an object must have textures to count as complete.
+# Least share of an object's area with textures for the object to count as complete.
 MIN_COMPLETE_AREA = 0.95
 # Random lights are numbered below this.
 RANDOM_LIGHTS = 10**9
@@ -63,8 +63,12 @@ def require_complete_pbr(scene: Scene, name: str) -> None:
         )
 
 
-class Lamps(NamedTuple):
-    """The light of one object in the forms it is used in; record is that of light.json."""
+class PreparedLight(NamedTuple):
+    """Hold the light of one object in four forms.
+
+    environment: metered. lobes: spherical Gaussians. record: what light.json stores. direct: estimates light on surface
+    points.
+    """
 
     environment: Environment
     lobes: SphericalGaussians
@@ -73,27 +77,31 @@ class Lamps(NamedTuple):
 
 
 def light_name(light: str, name: str, seed: int, views: Folder | None) -> str:
-    """Resolve the light "random": to that of the views, where a name brings it back, else to random:NUMBER.
+    """Resolve the light "random" to a name that studio() takes; any other light is returned unchanged.
 
-    The number is drawn by seed and the object's name. Another light is returned as it is.
+    With a views folder it is the name of that folder's light, if it is a random or a bundled one. Otherwise it is
+    random:NUMBER, where seed and the object's name decide the number.
     """
     if light == "random" and views is not None:
         used = views.content_as(ViewsContent).environment
-        # A light from an image file is not here to be read again.
+        # The file of another light may be missing here.
         light = used if used.startswith("random:") or used in BUNDLED else light
     if light == "random":
         light = f"random:{(seed_of(name) + seed) % RANDOM_LIGHTS}"
     return light
 
 
-def prepare_lamps(renderer: Renderer, light: str, samples: int, seed: int, brdf: str) -> Lamps:
-    """Prepare a light by its name; samples: directions per point, from the light and from the reflection each."""
+def prepare_light(renderer: Renderer, light: str, samples: int, seed: int, brdf: str) -> PreparedLight:
+    """Prepare a light by its name, as studio() takes it, for shading the renderer's scene.
+
+    samples: directions that a point draws from the light, and as many from its reflection. brdf: "gltf" or "paper".
+    """
     import torch
 
-    # Shading runs in threads of this program, a chunk each; torch's would only wait for each other.
+    # Chunks of points are shaded in threads of this program; torch's threads would only slow them down.
     torch.set_num_threads(1)
     environment, lobes, record = studio(light, seed)
-    return Lamps(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))
+    return PreparedLight(environment, lobes, record, DirectLight(renderer, environment, samples, seed, brdf))
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class ViewOptions:
 def render_views(
     renderer: Renderer,
     cameras: list[Camera],
-    lamps: Lamps | None,
+    lamps: PreparedLight | None,
     options: ViewOptions,
     progress: Callable = lambda iterable, total, label: iterable,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
@@ -128,7 +136,7 @@ def render_views(
 
 
 def _render_view(
-    renderer: Renderer, camera: Camera, lamps: Lamps | None, options: ViewOptions
+    renderer: Renderer, camera: Camera, lamps: PreparedLight | None, options: ViewOptions
 ) -> dict[str, np.ndarray]:
     """Render one view's images by domain, "color" and "closed_form" only where they are asked for."""
     shade = lamps.direct.color(options.exposure) if lamps is not None and "color" in options.domains else None
@@ -161,7 +169,7 @@ def clipped_share(images: dict[str, np.ndarray], mask: np.ndarray) -> float:
     return float((images["color"][mask > 0] > 1).mean()) if "color" in images else 0.0
 
 
-def figures(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: Lamps | None) -> dict[str, float]:
+def figures(scene: Scene, renderer: Renderer, mask: np.ndarray, lamps: PreparedLight | None) -> dict[str, float]:
     """Collect the figures of the manifest."""
     report = {
         "faces": len(scene.faces),

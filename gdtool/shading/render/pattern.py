@@ -1,4 +1,4 @@
-"""Place samples in a pixel."""
+"""Spread the samples of a pixel evenly inside it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ PATTERN_SEEDS = (4292928315, 3747378854)
 def pixel_pattern(count: int, first: int = 4) -> np.ndarray:
     """Make (count, 2) scrambled Sobol points in [0, 1)², to be used in passes.
 
-    The first pass has `first` points, each later one as many as all before it. Each pass is spread evenly, and so are
-    all passes up to it together. The scrambling is nested and hash-based (Burley 2020, "Practical hash-based Owen
+    The first pass has `first` points, and each later one as many as all before it. Each pass is spread evenly, and so
+    are all passes up to it together. The scrambling is nested and hash-based (Burley 2020, "Practical hash-based Owen
     scrambling"). Each pass is then shifted slightly, so that its mean is the pixel's centre and a linear function is
-    averaged exactly. (Without scrambling, the shift would put each pass on top of the one before.)
+    averaged exactly. Without scrambling, the shift would move each pass onto the one before.
     """
     index = np.arange(count, dtype=np.uint32)
     second = np.zeros(count, np.uint32)
@@ -24,9 +24,7 @@ def pixel_pattern(count: int, first: int = 4) -> np.ndarray:
         second ^= np.where((index >> np.uint32(bit)) & np.uint32(1), column, np.uint32(0)).astype(np.uint32)
         column ^= column >> np.uint32(1)
     out = (
-        np.stack(
-            [_owen_scrambled(_reversed_bits(index), PATTERN_SEEDS[0]), _owen_scrambled(second, PATTERN_SEEDS[1])], 1
-        )
+        np.stack([_owen_scramble(_reverse_bits(index), PATTERN_SEEDS[0]), _owen_scramble(second, PATTERN_SEEDS[1])], 1)
         / 2.0**32
     )
     start, stop = 0, first
@@ -36,7 +34,7 @@ def pixel_pattern(count: int, first: int = 4) -> np.ndarray:
     return np.clip(out, 0, 1 - 1e-9)
 
 
-def _reversed_bits(x: np.ndarray) -> np.ndarray:
+def _reverse_bits(x: np.ndarray) -> np.ndarray:
     """Reverse the order of the bits of (n,) uint32."""
     for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
         s, m = np.uint32(shift), np.uint32(mask)
@@ -44,13 +42,13 @@ def _reversed_bits(x: np.ndarray) -> np.ndarray:
     return x
 
 
-def _owen_scrambled(x: np.ndarray, seed: int) -> np.ndarray:
+def _owen_scramble(x: np.ndarray, seed: int) -> np.ndarray:
     """Scramble (n,) uint32 fractions: flip each bit by a hash of the bits above it (Laine & Karras 2011).
 
     This is no general integer mixer (geometry.hashing.splitmix64): the nesting keeps the points stratified.
     """
     with np.errstate(over="ignore"):
-        x = _reversed_bits(x) + np.uint32(seed)
+        x = _reverse_bits(x) + np.uint32(seed)
         for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
             x ^= x * np.uint32(factor)
-    return _reversed_bits(x)
+    return _reverse_bits(x)

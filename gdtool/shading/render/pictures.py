@@ -1,4 +1,4 @@
-"""Render lit pictures of a scene, under direct light or in closed form, until a goal is reached."""
+"""Render lit pictures of a scene, by sampled direct light or in closed form, until a time or a PSNR is reached."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ OPEN_ENDED = 4096
 
 @dataclass(frozen=True)
 class PictureOptions:
-    """How to render pictures.
+    """Set how pictures are rendered.
 
-    samples: the most per pixel of a view that no goal ends. exposure: factor on the color. brdf: of the closed form.
-    Goals: seconds, for all views together; psnr, the estimated dB at which a view is done.
+    samples: the most samples of a pixel, in a view that no goal ends. exposure: factor on the color. brdf: "gltf" or
+    "paper", for closed form. Goals: seconds, for all views together; psnr, the estimated dB at which a view is done.
     """
 
     samples: int
@@ -41,7 +41,11 @@ class PictureOptions:
 
 
 class Pictures(NamedTuple):
-    """Each view's picture (h, w, 4) sRGB with alpha, share of clipped pixels, and estimated PSNR in dB or None."""
+    """Hold, for each view, the picture, its share of clipped pixels, and its estimated PSNR.
+
+    images: (h, w, 4), sRGB with alpha, 0 to 1. clipped: share of covered channels above 1. psnr: in dB, or None where
+    it was not estimated.
+    """
 
     images: list[np.ndarray]
     clipped: list[float]
@@ -65,23 +69,24 @@ def render_pictures(
     options: PictureOptions,
     progress: Callable = lambda iterable, total, label: iterable,
 ) -> Pictures:
-    """Render a picture for each camera: by direct light with shadows, or by lobes in closed form without.
+    """Render a picture for each camera.
 
-    progress(iterable, total, label) reports the views done.
+    light: DirectLight renders with shadows; SphericalGaussians shade in closed form without. progress(iterable, total,
+    label) wraps the loop over the views.
     """
     shade = light.color(options.exposure) if isinstance(light, DirectLight) else None
-    out, begun = Pictures([], [], []), time.perf_counter()
+    out, started = Pictures([], [], []), time.perf_counter()
     for number, camera in enumerate(progress(cameras, len(cameras), "frames")):
         seconds = None
         if options.seconds is not None:
             # Each view gets an equal part of the time that is left.
-            seconds = max(0.0, options.seconds - (time.perf_counter() - begun)) / (len(cameras) - number)
+            seconds = max(0.0, options.seconds - (time.perf_counter() - started)) / (len(cameras) - number)
         frame = renderer.buffers(camera, options.most_samples, shade, Goal(seconds, options.psnr))
         out.psnr.append(renderer.counts.estimated_psnr)
         if shade is None:
             frame["color"] = closed_form_image(frame, camera, light, options.brdf) * options.exposure
-        seen = frame["color"][frame["mask"] > 0]
-        out.clipped.append(float((seen > 1).mean()) if len(seen) else 0.0)
+        covered = frame["color"][frame["mask"] > 0]
+        out.clipped.append(float((covered > 1).mean()) if len(covered) else 0.0)
         color = srgb_from_linear(np.clip(frame["color"], 0, 1))
         out.images.append(np.concatenate([color, frame["mask"][..., None]], -1))
     return out

@@ -1,11 +1,11 @@
 """Render images of a scene by ray casting: buffers of its geometry and material, and lit color.
 
 A pixel is a box: its value is the mean over samples spread evenly inside it. Sampling is adaptive. Every pixel in the
-object's projected bounds gets BASE_SAMPLES. Their number doubles, up to the allowed one, while the pixel is partly
-covered or its mean is not known to TOLERANCE.
+object's projected bounds gets BASE_SAMPLES. The number doubles, up to the limit of the call, while the pixel is partly
+covered or the standard error of its mean is above TOLERANCE.
 
-Transparency: MASK materials are cut as glTF says. BLEND materials are seen where alpha >= 0.5 and absent below, since a
-buffer holds one surface. Faces are seen from both sides, whatever the material's doubleSided says.
+Transparency: MASK materials are cut out as glTF says. BLEND materials are opaque where alpha >= 0.5 and absent below,
+since a buffer holds one surface. Faces are seen from both sides, whatever the material's doubleSided says.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ BASE_SAMPLES = 4
 # While pixels have at most this many samples, those beside an outline or beside an unresolved pixel get more too: the
 # detail that leaves the neighbour unresolved may pass between their samples.
 OUTLINE_SAMPLES = 8
-# The most alpha-tested layers that a ray passes through; behind them it meets nothing.
+# The most alpha-tested layers that a ray passes through; what is behind them is not hit.
 MAX_LAYERS = 32
 # The standard error of a pixel's mean, in the units a picture stores (sRGB, (n + 1) / 2), above which it gets more
-# samples. Color gets a larger one: its noise costs more to take away.
+# samples. Color has a larger one, since its noise costs more to reduce.
 TOLERANCE = {"normal": 0.009, "albedo": 0.009, "roughness": 0.009, "metallic": 0.009, "color": 0.018}
 # Factor from a value to the units a picture stores; None: the sRGB curve.
 STORED_SCALE = {"normal": 0.5, "albedo": None, "roughness": 1.0, "metallic": 1.0, "color": None}
@@ -52,10 +52,10 @@ BAND_SAMPLES = 1 << 16
 
 @dataclass(frozen=True)
 class Goal:
-    """When to stop before a view has all its samples.
+    """Set when a view ends before its pixels have all their samples.
 
-    seconds: after that time. psnr: when the color's estimated error is that many dB (peak 1, sRGB, over the covered
-    pixels).
+    seconds: limit of the time, None for none. psnr: estimated PSNR of the color in dB (peak 1, sRGB, over the covered
+    pixels) at which the view is done, None for none.
     """
 
     seconds: float | None = None
@@ -64,11 +64,11 @@ class Goal:
 
 @dataclass
 class ShadingPoints:
-    """Surface points that a camera sees, one for each sample that hits; the samples of a pixel follow each other.
+    """Hold n surface points that a camera sees, one for each sample that hits; the samples of a pixel are consecutive.
 
-    pixel (n,) flat index; sample (n,) number within the pixel; position (n, 3); view (n, 3) unit toward the eye; depth
-    (n,) along the viewing axis; values: attributes as SurfaceLookup.attributes returns them; per_pixel: samples that a
-    fully covered pixel has once these are added.
+    pixel (n,): flat index. sample (n,): number within the pixel. position (n, 3). view (n, 3): unit, toward the eye.
+    depth (n,): along the viewing axis, in world units. values: attributes as SurfaceLookup.attributes returns them.
+    per_pixel: samples that a pixel has had when these are done.
     """
 
     pixel: np.ndarray
@@ -85,7 +85,7 @@ class ShadingPoints:
 
 @dataclass
 class Counts:
-    """Count the work that a renderer did and left out, over all its views; seconds are by step."""
+    """Count the work that a renderer did and left out, over all its views. seconds: the time of each step, by name."""
 
     pixels: int = 0
     pixels_in_bounds: int = 0
@@ -100,7 +100,7 @@ class Counts:
     lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def spend(self, what: str, since: float, **more: int) -> None:
-        """Add the seconds since a time.perf_counter() to a step, and more to other counts by name; thread-safe."""
+        """Add the seconds since a time.perf_counter() to the step `what`, and numbers to other counts; thread-safe."""
         with self.lock:
             self.seconds[what] = self.seconds.get(what, 0.0) + time.perf_counter() - since
             for name, count in more.items():
@@ -108,7 +108,10 @@ class Counts:
 
 
 class Renderer:
-    """Render views of one scene; holds its ray casters, material lookup and thread pool."""
+    """Render views of one scene; holds its ray casters, material lookup and thread pool.
+
+    threads: of the pool, None for as many as there are cores.
+    """
 
     def __init__(self, scene: Scene, threads: int | None = None):
         self.scene = scene
@@ -129,7 +132,11 @@ class Renderer:
         self.pool = ThreadPoolExecutor(self.caster.threads)
 
     def trace(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find first hits that pass the alpha test: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3)."""
+        """Find the first hits of n rays that pass the alpha test.
+
+        Takes origins and unit directions (n, 3). Returns face_idx (n,), -1 for no hit, distance (n,) and barycentric
+        (n, 3).
+        """
         hits = self.caster.first_hit(origins, directions)
         face_idx, distance, barycentric = hits.face_idx, hits.distance, hits.barycentric
         if self.tested is None:
@@ -152,7 +159,10 @@ class Renderer:
         return face_idx, distance, barycentric
 
     def occluded(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Test whether a surface that passes the alpha test lies along each ray: (n,) bool."""
+        """Test whether a surface that passes the alpha test is hit by each ray: (n,) bool.
+
+        origins, directions (n, 3): the directions are unit.
+        """
         out = self.solid_caster.occluded(origins, directions)
         if self.tested is None:
             return out
@@ -172,9 +182,10 @@ class Renderer:
         return out
 
     def may_be_hidden(self, position: np.ndarray, geometric_normal: np.ndarray) -> np.ndarray | None:
-        """Test whether anything can lie in front of points (n, 3): (n,) bool, or None where all may be hidden.
+        """Test whether anything can lie in front of points (n, 3): (n,) bool, or None where it can for all points.
 
-        A point on the outside of a convex scene is hidden from no direction above its horizon.
+        geometric_normal (n, 3): unit. Of a convex scene, nothing hides a point on the outside from a direction above
+        its horizon.
         """
         if not self.convex:
             return None
@@ -194,7 +205,8 @@ class Renderer:
     ) -> ShadingPoints:
         """Find the surface points that pixels (m,) see at the subpixel offsets pattern[first:].
 
-        pattern (k, 2) has all the samples that a pixel then has. Without emission, it is not looked up.
+        pixel: flat indices. pattern (k, 2): offsets in [0, 1) of all samples that a pixel then has; those before
+        `first` are done already. emission: whether to look up the emission.
         """
         sample = np.arange(first, len(pattern))
         x, y = (
@@ -217,9 +229,9 @@ class Renderer:
             origins += camera.backward * back
         else:
             back = 0.0
-        begun = time.perf_counter()
+        started = time.perf_counter()
         face_idx, distance, barycentric = self.trace(origins, directions)
-        self.counts.spend("rays", begun, samples=len(pixel))
+        self.counts.spend("rays", started, samples=len(pixel))
         hit = np.flatnonzero(face_idx >= 0)
         if len(hit) < len(pixel):
             pixel, sample, face_idx, distance, along = (x.take(hit) for x in (pixel, sample, face_idx, distance, along))
@@ -233,27 +245,27 @@ class Renderer:
         return ShadingPoints(pixel, sample, position, -directions, depth, values, len(pattern))
 
     def render_each(self, work: Callable[[Camera], dict], cameras: Iterable[Camera]) -> Iterator[dict]:
-        """Yield work(camera) of each camera, in order, two at once.
+        """Yield work(camera) for each camera, in order, with two cameras at a time in threads.
 
-        While one view's sums are evaluated, the other one's rays are traced.
+        One view's rays are traced while the sums of the other are evaluated.
         """
         with ThreadPoolExecutor(min(2, self.caster.threads)) as pool:
             yield from pool.map(work, cameras)
 
     def buffers(self, camera: Camera, samples: int = 16, shade=None, goal: Goal = Goal()) -> dict[str, np.ndarray]:
-        """Render one view: an image (h, w[, c]) float32 for each domain, and "mask", as render_buffers says.
+        """Render one view: an image (h, w[, c]) float32 for each domain, and "mask", as render_buffers returns them.
 
         Args:
             camera: the view.
             samples: the most samples of a pixel.
-            shade: shade(points) -> {"color": (n, 3)} adds the image "color".
+            shade: function from ShadingPoints to {"color": (n, 3)}; with it, the result has the image "color".
             goal: when to stop earlier.
         """
-        begun = time.perf_counter()
+        started = time.perf_counter()
         height, width = camera.height, camera.width
         top, bottom, left, right = self.window(camera)
         self.counts.spend(
-            "bounds", begun, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
+            "bounds", started, pixels=height * width, pixels_in_bounds=max(bottom - top, 0) * max(right - left, 0)
         )
         film, pattern = _Film(height * width), pixel_pattern(samples, BASE_SAMPLES)
         pixel = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)[None]).ravel()
@@ -274,7 +286,7 @@ class Renderer:
                 break
             pixel, error = film.unresolved(pixel, width, height, tolerance, done)
             if goal.seconds is not None:
-                spent = time.perf_counter() - begun
+                spent = time.perf_counter() - started
                 room = int((goal.seconds - spent) / spent * taken / done) if goal.seconds > spent else 0
                 if room < len(pixel):
                     pixel = np.sort(pixel[np.argsort(-error, kind="stable")[:room]])
@@ -284,17 +296,20 @@ class Renderer:
     def _add_samples(
         self, film: _Film, camera: Camera, pixel: np.ndarray, pattern: np.ndarray, first: int, shade
     ) -> None:
-        """Add the samples pattern[first:] of pixels (m,) to the film, band by band in the thread pool."""
+        """Add the samples pattern[first:] of pixels (m,) to the film, a band of pixels in each task of the thread pool.
+
+        shade: see buffers().
+        """
         more = len(pattern) - first
         # Each thread gets as many bands as the others, or one would wait; a small picture is one band.
         bands = -(-len(pixel) * more // BAND_SAMPLES)
         step = -(-len(pixel) // (bands if bands == 1 else -(-bands // self.caster.threads) * self.caster.threads))
 
         def trace_band(part: np.ndarray) -> tuple[np.ndarray, int, ShadingPoints, dict]:
-            begun = time.perf_counter()
+            started = time.perf_counter()
             points = self.trace_pixels(camera, part, pattern, first, shade is not None)
             shaded = shade(points) if shade is not None and len(points) else {}
-            self.counts.spend("samples", begun, pixels_refined=len(part) if first == BASE_SAMPLES else 0)
+            self.counts.spend("samples", started, pixels_refined=len(part) if first == BASE_SAMPLES else 0)
             return part, more, points, shaded
 
         waiting: deque = deque()
@@ -307,9 +322,9 @@ class Renderer:
 
 
 class _Film:
-    """Accumulate sums and sums of squares over samples, a row for each pixel.
+    """Accumulate the sums and the sums of squares of samples, a row for each pixel.
 
-    samples (p,) counts a pixel's samples, hits (p,) those that hit the surface.
+    samples (p,): samples of each of p pixels. hits (p,): those of them that hit the surface.
     """
 
     def __init__(self, pixels: int):
@@ -317,13 +332,13 @@ class _Film:
         self.samples, self.hits = np.zeros(pixels), np.zeros(pixels)
         self.sums: dict[str, np.ndarray] = {}
         self.squares: dict[str, np.ndarray] = {}
-        # Of the last call of update_psnr: means, samples, and each pixel's squared error.
+        # Set by update_psnr: means and samples at its last call, and each pixel's squared error.
         self.last_mean: np.ndarray | None = None
         self.last_samples: np.ndarray | None = None
         self.squared_change: np.ndarray | None = None
 
     def add(self, pixel: np.ndarray, times: int, points: ShadingPoints, shaded: dict[str, np.ndarray]) -> None:
-        """Add the points that `times` samples of each of pixels (m,) hit, and their shaded values."""
+        """Add `times` samples of each of pixels (m,): the points that they hit, and shaded values by name."""
         self.samples[pixel] += times
         if not len(points):
             return
@@ -344,7 +359,11 @@ class _Film:
                 self.squares[name][owner] += np.add.reduceat(value * value, starts, axis=1).T
 
     def error(self, name: str, pixel: np.ndarray) -> np.ndarray:
-        """Estimate the squared error (n,) of the means of pixels (n,), in stored units, averaged over channels."""
+        """Estimate the squared error (n,) of the means of pixels (n,), averaged over channels.
+
+        name: a key of STORED_SCALE. The unit is that of the stored picture, for example sRGB values in [0, 1] for
+        albedo.
+        """
         count = np.maximum(self.hits[pixel], 1)[:, None]
         mean = self.sums[name][pixel] / count
         variance = np.maximum(self.squares[name][pixel] / count - mean * mean, 0)
@@ -353,9 +372,10 @@ class _Film:
         return (variance / count * (slope * spread) ** 2).mean(1)
 
     def update_psnr(self) -> float | None:
-        """Estimate the color's error in dB from what the samples since the last call changed; None while unknown.
+        """Estimate the color's PSNR in dB from what changed since the last call; None at the first call or without
+        color.
 
-        The last pass doubles a pixel's samples: half of them are compared with all.
+        A pass doubles a pixel's samples, so the mean over half of them is compared with the mean over all.
         """
         if "color" not in self.sums:
             return None
@@ -378,21 +398,23 @@ class _Film:
     def unresolved(
         self, pixel: np.ndarray, width: int, height: int, tolerance: dict[str, float], done: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Choose those of pixels (m,) that need more samples, and rate each one's squared error.
+        """Choose the pixels among (m,) that need more samples, and estimate the squared error of each.
 
-        Chosen are partly covered pixels, and those whose mean is not known to the tolerance. While they have few
-        samples (done <= OUTLINE_SAMPLES), also those at the outline and beside a chosen one.
+        Chosen are partly covered pixels, and pixels whose error exceeds the tolerance. As long as pixels have few
+        samples (done <= OUTLINE_SAMPLES), also pixels at the outline, and neighbours of a chosen one.
+
+        tolerance: the largest standard error of each domain. done: samples that each pixel has.
 
         Returns:
             The chosen pixels (n,), and their squared error (n,) in units of the squared tolerance; inf where partly
-            covered.
+                covered.
         """
         hits = self.hits[pixel]
         partly = (hits > 0) & (hits < self.samples[pixel])
         if done <= OUTLINE_SAMPLES:
             covered = (self.hits > 0).reshape(height, width)
             whole = (self.hits == self.samples).reshape(height, width) & covered
-            partly |= ((hits == 0) & _dilated(covered)[pixel]) | ((hits > 0) & _dilated(~whole)[pixel])
+            partly |= ((hits == 0) & _dilate(covered)[pixel]) | ((hits > 0) & _dilate(~whole)[pixel])
         worst = np.zeros(len(pixel))
         some = np.flatnonzero(hits > 0)
         for name in STORED_SCALE:
@@ -402,11 +424,11 @@ class _Film:
         if done <= OUTLINE_SAMPLES:
             image = np.zeros(width * height, bool)
             image[pixel[chosen]] = True
-            chosen |= (hits > 0) & _dilated(image.reshape(height, width))[pixel]
+            chosen |= (hits > 0) & _dilate(image.reshape(height, width))[pixel]
         return pixel[chosen], np.where(partly, np.inf, worst)[chosen]
 
     def images(self, camera: Camera, more: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
-        """Divide the sums into images (h, w[, c]) float32 of the domains and of more names, and the mask."""
+        """Compute the mean images (h, w[, c]) float32 of DOMAINS and of the names in `more`, and the mask (h, w)."""
         shape = (camera.height, camera.width)
         out = {"mask": (self.hits / np.maximum(self.samples, 1)).reshape(shape).astype(np.float32)}
         count = np.maximum(self.hits, 1)[:, None]
@@ -423,7 +445,7 @@ class _Film:
         return out
 
 
-def _dilated(inside: np.ndarray) -> np.ndarray:
+def _dilate(inside: np.ndarray) -> np.ndarray:
     """Dilate a bool image (h, w) by one pixel in all eight directions; flat (h * w,)."""
     padded = np.pad(inside, 1)
     rows = padded[:-2] | padded[1:-1] | padded[2:]
@@ -445,8 +467,8 @@ def render_buffers(scene: Scene, camera: Camera, samples: int = 16) -> dict[str,
     """Render a scene's buffers for one camera.
 
     Returns:
-        normal (h, w, 3) shading normals in world axes, depth (h, w), albedo (h, w, 3) linear, roughness (h, w),
-        metallic (h, w), mask (h, w) coverage; float32. Values are means over the covered part of a pixel, 0 where
-        nothing is seen.
+        By name, float32: normal (h, w, 3) shading normals in world axes, depth (h, w) in world units, albedo (h, w, 3)
+            linear, roughness and metallic (h, w), mask (h, w) coverage in [0, 1]. Values are means over the covered
+            part of a pixel, and 0 where nothing is seen.
     """
     return Renderer(scene).buffers(camera, samples)

@@ -11,9 +11,10 @@ from gdtool.cameras.camera import DISTANCE, HALF_WIDTH, SIX_VIEWS, rig
 def camera(
     azimuth: float, elevation: float, name: str, size: int, fov: float = 0.0, half_width: float = HALF_WIDTH
 ) -> Camera:
-    """Make a camera that sees the whole normalised object; angles in degrees, fov across, 0 is orthographic.
+    """Make a camera that sees the whole normalised object.
 
-    A perspective camera stands where a sphere of radius half_width fills its view.
+    azimuth, elevation: in degrees. size: pixels a side. fov: field of view in degrees across the image; 0 is
+    orthographic. A perspective camera stands where a sphere of radius half_width, in world units, fills its view.
     """
     if not fov:
         return camera_at(azimuth, elevation, name=name, size=size, half_width=half_width)
@@ -25,13 +26,19 @@ def camera(
 def turntable(
     views: int, size: int, elevation: float = 0.0, fov: float = 0.0, stops: tuple[tuple[str, float], ...] = ()
 ) -> list[Camera]:
-    """Place cameras evenly around the object, from the front toward +X; or at named stops (name, azimuth)."""
+    """Place `views` cameras evenly around the object, from the front toward +X, or one at each of the stops.
+
+    size: pixels a side. elevation, fov: in degrees; fov 0 is orthographic. stops: names and azimuths in degrees.
+    """
     stops = stops or tuple((f"{k:03d}", 360.0 * k / views) for k in range(views))
     return [camera(azimuth, elevation, name, size, fov) for name, azimuth in stops]
 
 
 def sphere(views: int, size: int, fov: float = 0.0) -> list[Camera]:
-    """Spread cameras evenly over the sphere around the object."""
+    """Spread `views` cameras evenly over the sphere around the object.
+
+    size: pixels a side. fov: in degrees; 0 is orthographic.
+    """
     from gdtool.shading.sampling import fibonacci
 
     out = []
@@ -55,10 +62,10 @@ def cameras_by_rig(name: str, views: int, size: int, elevation: float = 0.0, fov
 
 
 def condition_camera(rng: np.random.Generator, name: str, size: int) -> Camera:
-    """Draw a camera in front of the object, as a photographer would stand.
+    """Choose a random camera in front of the object, where a photographer might stand.
 
-    Elevation −15° to 30°, orthographic or perspective of 20° to 60°, the object at 60 to 100 % of its size in the rig's
-    views.
+    The elevation is −15° to 30°. The camera is orthographic, or perspective with a field of view of 20° to 60°. The
+    object has 60 to 100 % of its size in the rig's views. size: pixels a side.
     """
     elevation, perspective = rng.uniform(-15, 30), rng.random() < 0.5
     fov, scale = rng.uniform(20, 60), rng.uniform(0.6, 1.0)

@@ -1,4 +1,4 @@
-"""Report the work that a rendering left out because the scene did not need it, and about how long it would take."""
+"""Report the work that a rendering left out because the scene did not need it, and the time that this saved."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXTURES = {
 
 
 class SkippedStep(NamedTuple):
-    """One thing that was left out: what, why, and the seconds that it would have taken."""
+    """Describe work that was left out: what, why, and the seconds that it would have taken."""
 
     what: str
     why: str
@@ -30,10 +30,10 @@ class SkippedStep(NamedTuple):
 
 
 def skipped_work(renderer: Renderer, samples: int, light: DirectLight | None) -> list[SkippedStep]:
-    """List what the renderer and the light left out so far; samples is the most that a pixel could get.
+    """List the work that the renderer and the light have left out so far.
 
-    Seconds are the time that one such step took here, times the number of steps left out. For a texture that does not
-    exist they are the time of reading a tiny one.
+    samples: the most samples of a pixel. Seconds are the measured time of one such step, times the number of steps left
+    out. For a texture that does not exist it is the time of reading a tiny one.
     """
     return [
         *_texture_lookups(renderer),
@@ -44,7 +44,7 @@ def skipped_work(renderer: Renderer, samples: int, light: DirectLight | None) ->
 
 
 def _texture_lookups(renderer: Renderer) -> list[SkippedStep]:
-    """List the lookups of textures that are absent or constant, and alpha tests where all is opaque."""
+    """List the lookups of textures that are absent or constant, and the alpha tests of opaque scenes."""
     scene, taken, out = renderer.scene, max(renderer.counts.samples, 1), []
     absent = [what for what, name in TEXTURES.items() if all(getattr(m, name) is None for m in scene.materials)]
     if absent:
@@ -61,7 +61,7 @@ def _texture_lookups(renderer: Renderer) -> list[SkippedStep]:
 
 
 def _samples(renderer: Renderer, samples: int) -> list[SkippedStep]:
-    """List rays outside the object's bounds, and samples of pixels whose mean was known before."""
+    """List the rays outside the object's bounds, and the samples of pixels whose mean was known with fewer."""
     counts, out = renderer.counts, []
     taken = max(counts.samples, 1)
     if counts.pixels_in_bounds < counts.pixels:
@@ -74,7 +74,7 @@ def _samples(renderer: Renderer, samples: int) -> list[SkippedStep]:
         in_bounds = max(counts.pixels_in_bounds, 1)
         uniform = 1 - counts.pixels_refined / in_bounds
         why = (
-            f"{uniform:.0%} of the pixels in bounds are even and got {BASE_SAMPLES} of {samples}; "
+            f"{uniform:.0%} of the pixels in bounds are uniform and got {BASE_SAMPLES} of {samples}; "
             f"{counts.samples / in_bounds:.1f} on average"
         )
         out.append(SkippedStep("samples", why, float(fewer * counts.seconds.get("samples", 0.0) / taken)))
@@ -95,8 +95,8 @@ def _shadow_rays(renderer: Renderer) -> list[SkippedStep]:
         out.append(SkippedStep("shadow rays of convex objects", why, float(convex * each)))
     if rare:
         why = (
-            f"{rare / directions:.0%} of the directions bring little light and were left out by chance, "
-            "the others counting for more"
+            f"{rare / directions:.0%} of the directions contribute little light and were left out by chance, "
+            "with a larger weight for the others"
         )
         out.append(SkippedStep("shadow rays toward little light", why, float(rare * each)))
     return out
@@ -118,13 +118,13 @@ def _prefiltered_levels(light: DirectLight) -> list[SkippedStep]:
 
 
 def _lookup_seconds(count: int = 4096) -> float:
-    """Measure the seconds that reading a texture at one point takes on this machine."""
+    """Measure the seconds of a texture lookup at one point, on this machine, over count points."""
     from gdtool.assets.scene import Texture
     from gdtool.shading.render.textures import TextureReader
 
     reader = TextureReader(Texture(np.zeros((2, 2, 3), np.uint8), "srgb"))
     uv = np.random.default_rng(0).random((count, 2))
     reader.read(uv)  # the first read warms up
-    begun = time.perf_counter()
+    started = time.perf_counter()
     reader.read(uv)
-    return (time.perf_counter() - begun) / count
+    return (time.perf_counter() - started) / count

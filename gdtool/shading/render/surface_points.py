@@ -1,7 +1,7 @@
-"""Look a scene's material up at points of its triangles (glTF 2.0 metallic-roughness).
+"""Look up a scene's material at points of its triangles (glTF 2.0 metallic-roughness).
 
-Inside this module vectors of n points are (3, n), so that each component lies side by side in memory. They are float32,
-except where texture coordinates need float64. What is returned is (n, 3), a transposed view.
+Inside this module the vectors of n points are arrays (3, n), so that each component is contiguous in memory. They are
+float32, except where texture coordinates need float64. Results are transposed views (n, 3).
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ def _columns(values: np.ndarray, dtype=np.float32) -> np.ndarray:
 
 
 @dataclass
-class _Places:
-    """Places on the surface.
+class _SurfacePoints:
+    """Hold n points on the surface.
 
-    face_idx (n,); corners (3, n) vertex indices; exact, weights (3, n): barycentric in float64, float32; footprint
-    (n,), width in world units that a place stands for, or None.
+    face_idx (n,). corners (3, n): vertex indices. exact, weights (3, n): barycentric coordinates in float64 and in
+    float32. footprint (n,): width in world units of the area that a point stands for, or None.
     """
 
     face_idx: np.ndarray
@@ -53,9 +53,9 @@ class _Places:
     def __len__(self) -> int:
         return len(self.face_idx)
 
-    def part(self, chosen: np.ndarray) -> _Places:
-        """Return the chosen places, by index."""
-        return _Places(
+    def part(self, chosen: np.ndarray | slice) -> _SurfacePoints:
+        """Return the points with these indices (m,)."""
+        return _SurfacePoints(
             self.face_idx[chosen],
             self.corners[:, chosen],
             self.exact[:, chosen],
@@ -65,7 +65,7 @@ class _Places:
 
 
 class SurfaceLookup:
-    """Look one scene's materials up; mip levels and tangents are made when first needed. Thread-safe."""
+    """Look up one scene's materials. Mip levels and tangents are made when first needed. Thread-safe."""
 
     def __init__(self, scene: Scene):
         self.scene = scene
@@ -82,12 +82,12 @@ class SurfaceLookup:
         self._uvs = [_columns(uv, np.float64) for uv in scene.uvs]
 
     def alpha_faces(self) -> np.ndarray:
-        """Tell which faces have an alpha-tested material, MASK or BLEND: (f,) bool."""
+        """Find the faces whose material is alpha-tested, MASK or BLEND: (f,) bool."""
         tested = np.array([m.alpha_mode != "OPAQUE" for m in self.scene.materials] or [False])
         return tested[self.scene.material_idx]
 
     def _reader(self, *textures: Texture) -> TextureReader:
-        """Return the reader of textures of one layout, made when first asked for."""
+        """Return the reader of textures that have one layout (see same_layout). The first call makes it."""
         key = tuple(id(t) for t in textures)
         with self._lock:
             if key not in self._readers:
@@ -104,12 +104,12 @@ class SurfaceLookup:
         return self._constants[id(texture)]
 
     def _uv(self, texture: Texture) -> np.ndarray | None:
-        """Return the texture's UV set (v, 2), None where the scene lacks it."""
+        """Return the texture's UV set (v, 2), or None where the scene lacks it."""
         sets = self.scene.uvs
         return sets[texture.uv_set] if texture.uv_set < len(sets) else None
 
     def _density(self, texture: Texture, face_idx: np.ndarray) -> np.ndarray:
-        """Compute texels per world unit (n,) on faces: the root of the ratio of areas."""
+        """Compute texels per world unit (n,) on faces: the square root of the ratio of areas."""
         with self._lock:
             self._measure_uv(texture)
         height, width = texture.image.shape[:2]
@@ -117,22 +117,26 @@ class SurfaceLookup:
         return np.sqrt(self._uv_areas[texture.uv_set][face_idx] * stretch)
 
     def _measure_uv(self, texture: Texture) -> None:
-        """Compute the ratio (f,) of each face's area in the texture's UV set to its area in space."""
+        """Compute the ratio (f,) of each face's area in the texture's UV set to its area in world units, once a set."""
         if texture.uv_set not in self._uv_areas:
             a, b, c = (self._uv(texture)[self.scene.faces[:, i]] for i in range(3))
             u, v = b - a, c - a
             area = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
             self._uv_areas[texture.uv_set] = area / np.maximum(self.face_areas, 1e-300)
 
-    def _places(self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None) -> _Places:
-        """Gather places from faces (n,) and barycentric coordinates (n, 3)."""
+    def _surface_points(
+        self, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None
+    ) -> _SurfacePoints:
+        """Make surface points from faces (n,) and barycentric coordinates (n, 3)."""
         face_idx, exact = np.asarray(face_idx, np.intp), _columns(barycentric, np.float64)
-        return _Places(face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint)
+        return _SurfacePoints(
+            face_idx, np.take(self._faces, face_idx, axis=1), exact, exact.astype(np.float32), footprint
+        )
 
-    def _read(self, textures: dict[str, Texture | None], at: _Places) -> dict[str, np.ndarray]:
-        """Read textures at places: linear texels (c, n) by name, for those that exist and whose UV set exists.
+    def _read(self, textures: dict[str, Texture | None], at: _SurfacePoints) -> dict[str, np.ndarray]:
+        """Read textures at n surface points: linear texels (c, n) by name.
 
-        Textures of one layout are read together.
+        A texture that is None, or whose UV set the scene lacks, is left out. Textures of one layout are read together.
         """
         layouts: dict[tuple, list[str]] = {}
         out: dict[str, np.ndarray] = {}
@@ -155,8 +159,8 @@ class SurfaceLookup:
             out |= {name: texels[part] for name, part in zip(names, reader.parts, strict=True)}
         return out
 
-    def _shading_normals(self, at: _Places) -> np.ndarray:
-        """Interpolate unit vertex normals (3, n); the face's normal where there are none."""
+    def _shading_normals(self, at: _SurfacePoints) -> np.ndarray:
+        """Interpolate unit vertex normals (3, n); the face's normal where there are none, or where they cancel."""
         if self._normals is None:
             return np.take(self._flat, at.face_idx, axis=1)
         smooth = _interpolated(self._normals, at.corners, at.weights)
@@ -167,8 +171,8 @@ class SurfaceLookup:
         smooth /= length
         return smooth
 
-    def _tangent(self, texture: Texture, at: _Places) -> np.ndarray:
-        """Interpolate tangents (4, n): the file's, else MikkTSpace's for the texture's UV set."""
+    def _tangent(self, texture: Texture, at: _SurfacePoints) -> np.ndarray:
+        """Interpolate tangents with handedness (4, n): the file's, else MikkTSpace's for the texture's UV set."""
         with self._lock:
             self._make_tangents(texture)
         values = self._tangents[texture.uv_set]
@@ -225,11 +229,11 @@ class SurfaceLookup:
         return out
 
     def alpha(self, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Look alpha (n,) up, and the cutoff (n,) below which a point is absent.
+        """Look up alpha (n,), and the cutoff (n,) below which a point is absent.
 
-        The cutoff is 0 for OPAQUE materials, the material's for MASK, 0.5 for BLEND.
+        The cutoff is 0 for OPAQUE materials, the material's for MASK, and 0.5 for BLEND.
         """
-        scene, at = self.scene, self._places(face_idx, barycentric)
+        scene, at = self.scene, self._surface_points(face_idx, barycentric)
         alpha, cutoff = np.ones(len(at), np.float32), np.zeros(len(at), np.float32)
         owner = scene.material_idx[at.face_idx]
         for m in np.unique(owner):
@@ -256,24 +260,26 @@ class SurfaceLookup:
         directions: np.ndarray | None = None,
         emission: bool = True,
     ) -> dict[str, np.ndarray]:
-        """Look all attributes of n points up.
+        """Look up all attributes of n points.
 
         Args:
             face_idx: (n,) faces.
             barycentric: (n, 3) coordinates on them.
-            footprint: (n,) widths in world units that the points stand for; they choose the mip level.
-            directions: (n, 3) rays that see the points. Normals are then turned to the seen side, as glTF asks for
-                double-sided materials. This is done for all materials, since files whose winding and normals disagree
-                are common.
-            emission: whether to look the emission up; it is 0 otherwise.
+            footprint: (n,) widths in world units of the areas that the points stand for; they choose the mip level.
+            directions: (n, 3) rays that see the points. Normals are then turned to the side that is seen, as glTF asks
+                for double-sided materials. This is done for all materials, since files whose winding and normals
+                disagree are common.
+            emission: whether to look up the emission; it is 0 otherwise.
 
         Returns:
             albedo and emissive (n, 3) linear, roughness, metallic and alpha (n,), normal and geometric_normal (n, 3)
-            unit, f0 and f90 (n,) of the dielectric part at normal and grazing incidence (KHR_materials_ior, _specular),
-            all float32; unlit (n,) bool.
+                unit, f0 and f90 (n,) of the dielectric part at normal and grazing incidence (KHR_materials_ior,
+                _specular), all float32; unlit (n,) bool.
         """
         scene, n = self.scene, len(face_idx)
-        points = self._places(face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,)))
+        points = self._surface_points(
+            face_idx, barycentric, None if footprint is None else np.broadcast_to(footprint, (n,))
+        )
         out = _Attributes.empty(n)
         vertex_normal = self._shading_normals(points)
         normal = vertex_normal
@@ -320,8 +326,13 @@ class SurfaceLookup:
             normal = normal * np.where(dot(vertex_normal, geometric) < 0, np.float32(-1), np.float32(1))
         return out.as_dict(normal, geometric)
 
-    def _fill(self, out: _Attributes, at, material: Material, texels: dict[str, np.ndarray], here: _Places) -> None:
-        """Fill the points `at` of out, all of one material, but for their normals and emission."""
+    def _fill(
+        self, out: _Attributes, at, material: Material, texels: dict[str, np.ndarray], here: _SurfacePoints
+    ) -> None:
+        """Fill the attributes of points of one material, except for their normals and emission.
+
+        at: index of the points in out. texels: what _read() returned for these points, which are `here`.
+        """
         color = np.repeat(np.asarray(material.base_color, np.float32)[:, None], len(here), 1)
         texel = texels.get("color")
         if texel is not None:
@@ -344,7 +355,7 @@ class SurfaceLookup:
 
 @dataclass
 class _Attributes:
-    """Attributes of n points while they are filled: vectors (3, n), scalars (n,)."""
+    """Collect the attributes of n points: vectors (3, n), scalars (n,)."""
 
     albedo: np.ndarray
     emissive: np.ndarray
@@ -370,7 +381,7 @@ class _Attributes:
         )
 
     def as_dict(self, normal: np.ndarray, geometric: np.ndarray) -> dict[str, np.ndarray]:
-        """Clip to valid ranges, and return by name with the normals; vectors (n, 3)."""
+        """Clip the attributes to their ranges, and return them and the normals (3, n) by name; vectors are (n, 3)."""
         for values in (self.albedo, self.roughness, self.metallic, self.alpha):
             np.clip(values, 0, 1, out=values)
         return {
@@ -390,5 +401,5 @@ class _Attributes:
 def surface_attributes(
     scene: Scene, face_idx: np.ndarray, barycentric: np.ndarray, footprint: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """Look attributes of a scene up once: SurfaceLookup(scene).attributes."""
+    """Look up the attributes of n points of a scene, as SurfaceLookup.attributes does, without keeping the lookup."""
     return SurfaceLookup(scene).attributes(np.asarray(face_idx), np.asarray(barycentric, np.float64), footprint)

@@ -1,4 +1,4 @@
-"""Look textures up: wrap modes, bilinear filter, box-filtered mip levels, sRGB decoded before filtering."""
+"""Look up textures: wrap modes, bilinear filter, box-filtered mip levels, sRGB decoded before filtering."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gdtool.images.color import linear_from_srgb
 BAND = 256
 # Rows that are decoded at once: few enough that intermediate values stay in the cache.
 CACHED_ROWS = 16
-# Lookups, as a share of the finest level's texels, from which decoding all of it once costs less than decoding texels
-# one by one; and the most float32 numbers that it may have then (256 MB).
+# DECODE_SHARE: lookups, as a share of the finest level's texels, above which it is cheaper to decode the whole level
+# than single texels. MAX_DECODED: most float32 numbers of a level that is decoded whole (256 MB).
 DECODE_SHARE = 0.15
 MAX_DECODED = 1 << 26
 
@@ -44,7 +44,10 @@ def wrap_index(index: np.ndarray, size: int, wrap: str) -> np.ndarray:
 
 
 def same_layout(texture: Texture) -> tuple:
-    """Return a key of all that decides which texels and weights a uv reads; textures of one key are read together."""
+    """Return a key of all properties that decide which texels, with which weights, a UV coordinate reads.
+
+    Textures with the same key can be read together.
+    """
     return (
         texture.uv_set,
         texture.offset,
@@ -59,7 +62,7 @@ def same_layout(texture: Texture) -> tuple:
 
 
 class TextureReader:
-    """Read textures of one layout as linear float32, their channels side by side.
+    """Read textures of one layout (see same_layout) as linear float32, with their channels side by side.
 
     The finest level stays as the images store it. Coarser levels are box averages of about 2 x 2 texels, made when
     first needed. Several threads may read at once.
@@ -79,21 +82,25 @@ class TextureReader:
             None if top is None else linear_from_srgb(np.arange(top + 1, dtype=self.images[0].dtype)).astype(np.float32)
         )
         self._lock = threading.Lock()
-        # Lookups of the finest level so far, and all of it decoded once they are many.
-        self._asked, self._decoded = 0, None
+        # Number of lookups of the finest level so far, and that level decoded, once there are many.
+        self._lookups = 0
+        self._decoded: np.ndarray | None = None
 
     @property
     def channels(self) -> int:
-        """How many channels all textures have together."""
+        """Return the number of channels of all textures together."""
         return self.parts[-1].stop
 
     @property
     def depth(self) -> int:
-        """How many levels there can be, down to one texel."""
+        """Return the number of mip levels, down to one texel."""
         return max(self.images[0].shape[:2]).bit_length()
 
     def stored(self, index: np.ndarray) -> np.ndarray:
-        """Decode texels (n,) of the finest level, by row-major index, to (n, c) linear float32; alpha is never sRGB."""
+        """Decode texels of the finest level to (n, c) linear float32; alpha is never sRGB.
+
+        index (n,): row-major.
+        """
         out = np.empty((len(index), self.channels), np.float32)
         for image, part, colored in zip(self.images, self.parts, self.colored, strict=True):
             texels = np.take(image.reshape(-1, image.shape[2]), index, axis=0)
@@ -101,18 +108,19 @@ class TextureReader:
         return out
 
     def _decode(self, texels: np.ndarray, colored: bool, out: np.ndarray) -> None:
-        """Decode stored texels (..., c) of one image into out, linear float32.
+        """Decode stored texels (..., c) of one image into out (..., c), linear float32.
 
-        Channel by channel: numpy is slow on rows as short as a texel.
+        colored: whether the image is sRGB. Channels are decoded one at a time, since numpy is slow on rows as short as
+        a texel.
         """
-        for i, srgb in enumerate(_colored(texels.shape[-1], colored)):
+        for i, srgb in enumerate(_srgb_channels(texels.shape[-1], colored)):
             if srgb:
                 out[..., i] = self._linear(texels[..., i])
             else:
                 np.multiply(texels[..., i], self._unit, out=out[..., i], dtype=np.float32, casting="same_kind")
 
     def _linear(self, values: np.ndarray) -> np.ndarray:
-        """Decode stored sRGB values to linear float32."""
+        """Decode stored sRGB values of any shape to linear float32."""
         return (
             linear_from_srgb(values).astype(np.float32, copy=False)
             if self._table is None
@@ -137,42 +145,48 @@ class TextureReader:
                 self._make_next()
             return self.levels[k - 1]
 
-    def _levelled(self, k: int, count: int) -> np.ndarray | None:
-        """Return level k decoded, or None where decoding single texels is cheaper for count more lookups."""
+    def _decoded_level(self, k: int, count: int) -> np.ndarray | None:
+        """Return level k decoded, or None where it is cheaper to decode only the texels of `count` more lookups."""
         if k:
             return self.level(k)
         with self._lock:
             texels = self.images[0].shape[0] * self.images[0].shape[1]
-            self._asked += count
-            if self._decoded is None and self._asked > DECODE_SHARE * texels and texels * self.channels <= MAX_DECODED:
+            self._lookups += count
+            if (
+                self._decoded is None
+                and self._lookups > DECODE_SHARE * texels
+                and texels * self.channels <= MAX_DECODED
+            ):
                 self._decoded = self.level(0)
             return self._decoded
 
     def _make_next(self) -> None:
-        """Append the next coarser level."""
+        """Compute the next coarser level and append it to the levels."""
         finer = self.levels[-1:] or self.images
         parts = [slice(0, self.channels)] if self.levels else self.parts
         height, width = finer[0].shape[:2]
         coarse = np.empty((max(height // 2, 1), max(width // 2, 1), self.channels), np.float32)
-        halved = self._halved_even if height % 2 == width % 2 == 0 else self._halved_odd
+        halve = self._halve_even if height % 2 == width % 2 == 0 else self._halve_odd
         # Coarser levels are linear already.
         colored = None if self.levels else self.colored
 
         def make(row: int) -> None:
             for i, (image, part) in enumerate(zip(finer, parts, strict=True)):
-                halved(image, coarse[row : row + BAND // 2, :, part], row, None if colored is None else colored[i])
+                halve(image, coarse[row : row + BAND // 2, :, part], row, None if colored is None else colored[i])
 
         _each_band(make, len(coarse), BAND // 2)
         self.levels.append(coarse)
 
-    def _halved_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average 2 x 2 texels into out, rows of the coarser level from row on.
+    def _halve_even(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
+        """Average 2 x 2 texels of finer (h, w, c) into out, the rows of the coarser level from `row` on.
 
-        colored: whether finer is stored in sRGB; None where it is linear float32.
+        Both sides of finer are even. colored: whether it is stored in sRGB; None where it is linear float32 already.
         """
         band = finer[2 * row : 2 * (row + len(out))]
         wide = {"u1": np.uint16, "u2": np.uint32}.get(band.dtype.str[1:], np.float32)
-        for i, srgb in enumerate([False] * band.shape[2] if colored is None else _colored(band.shape[2], colored)):
+        for i, srgb in enumerate(
+            [False] * band.shape[2] if colored is None else _srgb_channels(band.shape[2], colored)
+        ):
             values = band[..., i]
             if srgb:
                 values = self._linear(values)
@@ -181,9 +195,9 @@ class TextureReader:
             unit = np.float32(0.25) * (np.float32(1) if srgb or colored is None else self._unit)
             np.multiply(pairs[:, 0::2] + pairs[:, 1::2], unit, out=out[..., i], casting="same_kind", dtype=np.float32)
 
-    def _halved_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
-        """Average as _halved_even where a side is odd: a coarser texel covers a bit of a third one, by its area."""
-        rows, columns = _shares(finer.shape[0])[:, row : row + len(out)], _shares(finer.shape[1])
+    def _halve_odd(self, finer: np.ndarray, out: np.ndarray, row: int, colored: bool | None) -> None:
+        """Average as _halve_even, where a side is odd: a coarser texel covers parts of three finer ones, by area."""
+        rows, columns = _area_shares(finer.shape[0])[:, row : row + len(out)], _area_shares(finer.shape[1])
         band = finer[2 * row : 2 * (row + len(out)) + 1]
         if colored is not None:
             linear = np.empty(band.shape, np.float32)
@@ -195,8 +209,9 @@ class TextureReader:
     def read(self, uv: np.ndarray, texels_per_sample: np.ndarray | None = None) -> np.ndarray:
         """Read (n, c) linear float32 at uv (n, 2), to which the texture transform is applied.
 
-        texels_per_sample (n,) is the width of a sample's footprint, in texels of the finest level; NaN counts as 0. The
-        nearest level at least as sharp is read. So supersampling converges to the finest level's box average.
+        texels_per_sample (n,): width of a sample's footprint, in texels of the finest level; NaN counts as 0. The
+        coarsest level is read that is still sharp enough for the footprint. So supersampling converges to the finest
+        level's box average.
         """
         uv = transform_uv(self.texture, np.nan_to_num(np.asarray(uv, np.float64), posinf=0.0, neginf=0.0))
         if texels_per_sample is None or self.depth == 1 or self.texture.filter == "nearest":
@@ -214,8 +229,8 @@ class TextureReader:
         return out
 
     def _read_level(self, uv: np.ndarray, k: int) -> np.ndarray:
-        """Read (n, c) from level k at transformed uv (n, 2)."""
-        image = self._levelled(k, len(uv))
+        """Read (n, c) linear float32 from level k at transformed uv (n, 2)."""
+        image = self._decoded_level(k, len(uv))
         height, width = self.images[0].shape[:2] if image is None else image.shape[:2]
         flat = None if image is None else image.reshape(-1, self.channels)
 
@@ -237,12 +252,12 @@ class TextureReader:
         x0, y0 = x0.astype(np.int64), y0.astype(np.int64)
         left, right = (wrap_index(x0 + i, width, self.texture.wrap_u) for i in (0, 1))
         top, bottom = (wrap_index(y0 + i, height, self.texture.wrap_v) * width for i in (0, 1))
-        upper = _between(texels(top + left), texels(top + right), fx)
-        return _between(upper, _between(texels(bottom + left), texels(bottom + right), fx), fy)
+        upper = _lerp(texels(top + left), texels(top + right), fx)
+        return _lerp(upper, _lerp(texels(bottom + left), texels(bottom + right), fx), fy)
 
 
 def _each_band(work, rows: int, band: int) -> None:
-    """Call work(first row) for every band of rows, on all cores."""
+    """Call work(first row) for every band of `band` rows, in threads on all cores."""
     starts = range(0, rows, band)
     if len(starts) > 1:
         with ThreadPoolExecutor(cores()) as pool:
@@ -251,13 +266,13 @@ def _each_band(work, rows: int, band: int) -> None:
         work(0)
 
 
-def _colored(channels: int, colored: bool) -> list[bool]:
-    """Tell which channels of an image are sRGB; alpha never is."""
+def _srgb_channels(channels: int, colored: bool) -> list[bool]:
+    """List for each channel of an image whether it is sRGB; alpha never is."""
     last = channels if channels in (1, 3) else channels - 1
     return [colored and i < last for i in range(channels)]
 
 
-def _shares(size: int) -> np.ndarray:
+def _area_shares(size: int) -> np.ndarray:
     """Compute the share by area of finer texels 2i, 2i + 1, … in coarser texel i: (taps, max(size // 2, 1)) float32."""
     half = size // 2
     if half == 0:
@@ -268,8 +283,8 @@ def _shares(size: int) -> np.ndarray:
     return (np.stack([half - i, np.full(half, half), i + 1]) / size).astype(np.float32)
 
 
-def _between(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
-    """Interpolate a + fraction (b − a), overwriting b."""
+def _lerp(a: np.ndarray, b: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Interpolate a + fraction (b − a) for arrays that broadcast, overwriting b."""
     b -= a
     b *= fraction
     b += a
