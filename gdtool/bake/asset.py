@@ -20,8 +20,8 @@ from gdtool.geometry.tangents import number_distinct_rows
 class AssetMeshes:
     """The meshes of an asset.
 
-    target: the triangles that were baked. mesh: the quads they came from. face_idx (t,): the quad of each triangle.
-    levels: coarser levels of detail, finest first.
+    target: the triangles that were baked. mesh: the quads that were cut into these triangles. face_idx (t,): the quad
+    of each triangle. levels: coarser levels of detail, finest first.
     """
 
     target: Target
@@ -32,10 +32,10 @@ class AssetMeshes:
 
 @dataclass(frozen=True)
 class AssetOptions:
-    """How to write an asset.
+    """Options for writing an asset's files.
 
-    name: of the object. convention: "opengl" or "directx", the green channel of normal.png. usd: file name of the
-    OpenUSD file; empty for none. threads: of the PNG encoder.
+    name: the object's name. convention: "opengl" or "directx", the direction of the green channel of normal.png. usd:
+    file name of the OpenUSD file; empty to write none. threads: the number that the PNG encoder uses.
     """
 
     name: str
@@ -45,7 +45,10 @@ class AssetOptions:
 
 
 def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
-    """Move meshes from the normalised frame to the source's by a similarity (4, 4): vertices, normals and tangents."""
+    """Transform meshes from the normalised frame to the source's by a similarity (4, 4).
+
+    Vertices, normals and tangents are transformed, those of the levels of detail too.
+    """
     turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
 
     def moved(target: Target) -> Target:
@@ -66,7 +69,7 @@ def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
 def material_of(
     maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False
 ) -> Material:
-    """Make the glTF material of maps; every factor is explicit."""
+    """Make a glTF material that uses the maps; every factor is written out, also where it has glTF's default."""
 
     def texture(image: np.ndarray | None, encoding: str) -> Texture | None:
         """Make a texture that clamps, so that a chart at the map's edge does not read the opposite edge."""
@@ -91,9 +94,10 @@ def material_of(
 
 
 def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene:
-    """Make a scene of the target's triangles. Corners that agree in everything become one vertex.
+    """Make a scene of the target's triangles.
 
-    Tangents are written only where a normal map needs them.
+    Corners with equal position, texture coordinates and normal (and tangent, where there is a normal map) share a
+    vertex. Tangents are written only where there is a normal map.
     """
     corner = np.arange(len(target.faces) * 3)
     position_idx, uv_idx = target.faces.ravel(), target.face_uvs.ravel()
@@ -128,7 +132,10 @@ def write_obj(
     files: dict[str, str],
     name: str,
 ) -> None:
-    """Write the quads as an .obj, and its .mtl beside it under the same name; files: file name by map name."""
+    """Write the quads as an .obj, and its .mtl beside it under the same stem.
+
+    files: the file name of each map, by the map's name.
+    """
     library = path.with_suffix(".mtl")
     lines = [f"mtllib {library.name}", f"o {_word(name)}"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
@@ -144,15 +151,16 @@ def write_obj(
 
 
 def _word(name: str) -> str:
-    """Replace what an .obj object name cannot hold by underscores."""
+    """Replace the characters that an .obj object name cannot contain by underscores."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "object"
 
 
 def material_library(maps: Maps, files: dict[str, str]) -> str:
-    """Compose the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
+    """Compose the text of the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) of newer readers.
 
     The normal map is named twice: Blender's importer ignores norm, and takes map_Bump for a normal map of strength -bm.
-    Roughness and metallic are channels of the packed map, chosen by -imfchan (Wavefront MTL 4.2).
+    Roughness and metallic are channels of the packed map, chosen by -imfchan (Wavefront MTL 4.2). files: the file name
+    of each map, by the map's name.
     """
     r, g, b, a = maps.factors["base_color"]
     lines = [
@@ -197,10 +205,10 @@ def corner_normals_of_quads(meshes: AssetMeshes) -> CornerNormals:
 def write_models(
     path: Callable[[str], Path], meshes: AssetMeshes, maps: Maps, surface: SurfaceModes, options: AssetOptions
 ) -> dict[str, str]:
-    """Write asset.glb, asset.obj, the maps, asset_lod1.glb and on, and OpenUSD where asked for.
+    """Write the asset's models and maps: asset.glb, asset.obj, PNG files, levels of detail and, if asked for, OpenUSD.
 
-    path(file name) says where. The coarser levels refer to the maps' files instead of holding them. Returns the file
-    name of each map.
+    path: returns where to write a file, from its name. Levels are written as asset_lod1.glb, asset_lod2.glb …, which
+    refer to the PNG files instead of containing them. Returns the file name of each map, by the map's name.
     """
     from gdtool.assets.gltf.write import write_glb
     from gdtool.bake.maps import contact_sheet_of
@@ -241,10 +249,10 @@ def _write_maps(
     convention: str,
     has_levels: bool,
 ) -> dict[int, str]:
-    """Write the maps that the material refers to; returns the file name, by id of the image, that a glTF may refer to.
+    """Write the material's maps as PNG files; return the file name for glTF to refer to, by the id() of each image.
 
-    With the directx convention, normal.png has its green channel inverted. glTF knows opengl only: so the coarser
-    levels refer to normal_opengl.png.
+    With the "directx" convention, normal.png has its green channel inverted. glTF knows "opengl" only, so where there
+    are levels of detail, normal_opengl.png is written for them as well.
     """
     from gdtool.bake.maps import directx
     from gdtool.images.io import write_png

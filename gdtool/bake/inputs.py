@@ -1,4 +1,4 @@
-"""Read what a bake is given: the mesh to bake for, and the surface or model to bake from."""
+"""Read the inputs of a bake: the mesh to bake for, and the surface or model to bake from."""
 
 from __future__ import annotations
 
@@ -36,11 +36,12 @@ MATERIALS = ("albedo", "roughness", "metallic")
 
 @dataclass
 class SourceChoice:
-    """What to bake from.
+    """The choice of a source to bake from.
 
-    surface, views: folders, where there are any. model: a model file or procedural:SEED that replaces the surface.
-    project_views: whether to read the views. size, samples: of the maps, where they are given (see target.fineness).
-    device: where networks run. skipped: filled with what was left out, and why.
+    surface, views: folders, None where there are none. model: a model file or procedural:SEED that replaces the
+    surface. project_views: whether to read the views. size: side of the maps in texels; samples: samples per texel;
+    None chooses either by the source's detail (target.fineness). device: the torch device for networks. skipped: (what,
+    why) of each input that was left out; reading appends to it.
     """
 
     surface: Folder | None
@@ -54,12 +55,12 @@ class SourceChoice:
 
 
 def path_of(source: Folder | Path | str) -> Path | str:
-    """Return the path that messages name a source by."""
+    """Return the path or name of a source, for messages."""
     return getattr(source, "path", source)
 
 
 def named_model(source: Folder | Path | str, model: str | None) -> str:
-    """Return the model to bake from: the given one, else the one that the mesh folder was remeshed from.
+    """Return the model to bake from: `model`, or without it the one that the mesh folder was remeshed from.
 
     Raises InputError where there is neither.
     """
@@ -82,9 +83,9 @@ def named_model(source: Folder | Path | str, model: str | None) -> str:
 def read_target_mesh(source: Folder | Path | str, surface: Folder | None) -> tuple[QuadMesh, np.ndarray]:
     """Read the mesh to bake for, in the normalised frame, and the matrix (4, 4) from there to its source's frame.
 
-    surface is what it is baked from, None for a model. A mesh file may be in either frame. One that fills the unit box
-    is taken to be normalised, like the surface; any other to be in the source's frame. Raises InputError for a mesh
-    without usable texture coordinates.
+    surface: the folder that is baked from, None for a model. A mesh file may be in either frame. If it fills the unit
+    box, it is taken to be normalised, like the surface; otherwise it is taken to be in the source's frame. Raises
+    InputError for a mesh without usable texture coordinates.
     """
     in_folder = hasattr(source, "content")
     if in_folder:
@@ -121,7 +122,7 @@ def _triangles_of_scene(path: Path) -> QuadMesh:
 
 
 def target_of(mesh: QuadMesh) -> tuple[Target, np.ndarray]:
-    """Cut quads into the triangles to bake into; also returns the quad (t,) that each comes from."""
+    """Cut a mesh of quads into the triangles to bake into; return them and the quad (t,) of each triangle."""
     uv, quad_uvs = mesh.texture_coordinates()
     faces, face_idx = mesh.triangulation
     # The texture corners are cut the same way: the second triangle of a quad has its corners 0, 2, 3.
@@ -133,7 +134,7 @@ def target_of(mesh: QuadMesh) -> tuple[Target, np.ndarray]:
 
 
 def uv_warnings(target: Target) -> list[str]:
-    """Describe what texture coordinates do that a bake cannot serve: overlap, or leave the unit square."""
+    """Return warnings of texture coordinates that spoil maps: those that overlap or leave the unit square."""
     from gdtool.geometry.uv_raster import owner_count
 
     out = []
@@ -151,10 +152,11 @@ def uv_warnings(target: Target) -> list[str]:
 def read_origin(
     source: Folder | Path | str, choice: SourceChoice, target: Target, matrix: np.ndarray
 ) -> tuple[Origin, bool]:
-    """Read what to bake from: the surface with its views, else the model that is named or was remeshed.
+    """Read what to bake from: the surface with its views, or else a model.
 
-    source is what the mesh was read from; matrix (4, 4) maps the normalised frame to the model's. Also returns whether
-    what was read is inside out beside the target; its faces are then turned round.
+    The model is the one that `choice` names, or the one that the mesh was remeshed from. source: what the mesh was read
+    from. matrix (4, 4): from the normalised frame to the model's. Also returns whether the faces of what was read were
+    turned round, because most of them faced away from the target's.
     """
     origin = _origin(source, choice, target, matrix)
     few = slice(None, None, max(1, len(target.faces) // MOST_COMPARED))
@@ -163,7 +165,7 @@ def read_origin(
 
 
 def _origin(source: Folder | Path | str, choice: SourceChoice, target: Target, matrix: np.ndarray) -> Origin:
-    """Read the surface or the model of read_origin."""
+    """Read the surface with its views, or else the model, as read_origin() does, but without turning faces."""
     if choice.model is None and choice.surface is not None:
         return _surface_origin(choice)
     from gdtool.assets.load import load_scene
@@ -198,7 +200,7 @@ def _surface_origin(choice: SourceChoice) -> Origin:
 
 
 def _read_picture(choice: SourceChoice, views: Views) -> Picture | None:
-    """Read the picture that the views were generated from, where their folder has it and they have an albedo."""
+    """Read the picture that the views were generated from; None where their folder lacks it or they have no albedo."""
     from gdtool.folders.views import read_picture
 
     image_and_camera = read_picture(choice.views, views.cameras)

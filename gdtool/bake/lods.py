@@ -28,7 +28,10 @@ MAX_EXCESS = 1.5
 
 @dataclass
 class Levels:
-    """Coarser levels, finest first; figures for the report; what was left out and why; warnings."""
+    """Coarser levels of detail, finest first.
+
+    report: figures for the report. skipped: (what, why) of each level that was left out.
+    """
 
     targets: list[Target] = field(default_factory=list)
     report: dict[str, float] = field(default_factory=dict)
@@ -129,10 +132,11 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
-    """Measure how far a level's surface is from the full mesh's at the same texture coordinates.
+    """Measure how far a level's surface is from the full mesh's surface at equal texture coordinates.
 
-    Compares `count` points of the level, on a chart image of side `size`. Returns drift_mean and drift_p99, shares of
-    the full mesh's extent, and outside, the share of the level's surface whose texture coordinates lie in no chart.
+    Compares `count` points of the level. The full mesh's points are looked up in a raster of its charts, `size` texels
+    a side. Returns drift_mean and drift_p99, as shares of the full mesh's extent, and outside: the share of the level's
+    surface whose texture coordinates lie in no chart.
     """
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of

@@ -11,7 +11,7 @@ from gdtool.shading.sampling import orthonormal_basis
 
 
 def cosine_directions(count: int) -> np.ndarray:
-    """Make (count, 2) points of the unit square, by the R2 low-discrepancy sequence (Roberts 2018)."""
+    """Compute (count, 2) points of the unit square by the R2 low-discrepancy sequence (Roberts 2018)."""
     golden = 1.32471795724474602596
     return (0.5 + np.arange(1, count + 1)[:, None] * np.array([1 / golden, 1 / golden**2])) % 1.0
 
@@ -25,10 +25,10 @@ def ambient_visibility(
     reach: float = np.inf,
     lift: float = 1e-4,
 ) -> np.ndarray:
-    """Trace the share of ray_count cosine-distributed rays from points (n, 3) that leave the surface: (n,) in [0, 1].
+    """Trace cosine-distributed rays from points (n, 3); return the share of each point's rays that hits nothing, (n,).
 
-    normals (n, 3) unit; caster is a SinglePrecisionCaster. Rays start `lift` above the surface, and only what
-    lies within reach blocks them.
+    normals (n, 3) unit; caster: a SinglePrecisionCaster; ray_count: rays per point. Rays start `lift` above the surface
+    and are `reach` long, both in world units.
     """
     rng = np.random.default_rng(seed)
     normals = normals.astype(np.float32)
@@ -50,9 +50,9 @@ def ambient_visibility(
 def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, threads: int = 1) -> np.ndarray:
     """Bake ambient visibility (n,) float32 of texels: traced at 1/scale of the map's size, and upsampled.
 
-    trace(face_idx, barycentric) -> (m,) gives the ambient visibility at places on the target. The upsampling is joint
-    bilateral: a coarse texel counts for a fine one only where it is near in space and faces the same way. So nothing
-    leaks between charts or across an edge. Fine texels without a similar coarse one are traced.
+    trace(face_idx, barycentric) -> (m,) gives the ambient visibility at points of the target. The upsampling is joint
+    bilateral: a coarse texel contributes to a fine one only where it is near in space and faces the same way. So
+    nothing leaks between charts or across an edge. Fine texels without a similar coarse one are traced.
     """
     size = texels.size
     coarse = texels_of(target, max(1, -(-size // scale)), rings=0)
@@ -97,7 +97,10 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
 
 
 def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
-    """Fill the rings around the charts, inner ones first, by means of known neighbours; changes values (n,)."""
+    """Fill the rings of texels around the charts with the mean of their known neighbours, innermost ring first.
+
+    values (n,), by texel, are changed in place.
+    """
     size, ring = texels.size, texels.texel[texels.inside :]
     slot = np.full((size + 2) * (size + 2), -1, np.int32)
     place = (texels.texel // size + 1) * (size + 2) + texels.texel % size + 1
@@ -117,9 +120,10 @@ def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
 
 
 def _similarity(near: np.ndarray, other: np.ndarray, wider: float = 1.0, reach: float = 3.0) -> np.ndarray:
-    """Weight pairs of places by distance and normal: (n,) in [0, 1], 0 at `reach` spacings times `wider`.
+    """Compute bilateral weights (n,) in [0, 1] of pairs of surface points, by distance and normal.
 
-    near and other (n, 6 or more): position in units of the spacing, and unit normal.
+    near and other (n, 6 or more): position in units of the texel spacing, then unit normal. The weight of distance is a
+    Gaussian of `wider` spacings, cut off at `reach` times that.
     """
     offset = near[:, :3] - other[:, :3]
     apart = dot(offset, offset) * np.float32(1 / wider**2)
@@ -129,9 +133,10 @@ def _similarity(near: np.ndarray, other: np.ndarray, wider: float = 1.0, reach: 
 
 
 def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
-    """Denoise known[:, 6] (m,) over 5 x 5 coarse texels, each weighted by its similarity in space and normal.
+    """Denoise the visibility of coarse texels (m,) by a joint bilateral filter over 5 x 5 texels.
 
-    slot (s, s) is the index of each coarse texel, -1 where there is none. Removes most of the noise of few rays.
+    known (m, 7): position in units of the texel spacing, unit normal, visibility. slot (s, s): the index of each coarse
+    texel, -1 where there is none. This removes most of the noise that few rays leave.
     """
     row, column = np.nonzero(slot >= 0)
     texel = slot[row, column]
@@ -156,7 +161,10 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
 
 
 def _spacing(at: np.ndarray, slot: np.ndarray) -> float:
-    """Estimate the width of a coarse texel in space: the median distance between horizontal neighbours."""
+    """Estimate the width of a coarse texel in space: the median distance between horizontal neighbours.
+
+    at (m, 3): positions; slot (s, s): the index of each texel, -1 where there is none.
+    """
     left, right = slot[:, :-1], slot[:, 1:]
     both = (left >= 0) & (right >= 0)
     if not both.any():

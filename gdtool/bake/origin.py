@@ -1,4 +1,4 @@
-"""Prepare what a bake reads from: a surface with its views, or a model with its textures."""
+"""Prepare the source of a bake: a surface with its views, or a model with its textures."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from gdtool.geometry.tangents import dot
 
 @dataclass(frozen=True)
 class Origin:
-    """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how viewers show it.
+    """A source in the normalised frame, the lookup of its material, and its vertex normals (v, 3).
 
-    label: where materials come from, for the report. detail: width of the finest detail that the source has, in the
-    normalised frame. It is a texel of its textures, half a pixel of its views, a pixel of the picture they were
-    generated from, or half an edge of its mesh.
+    label: where materials come from, for the report. alpha_mode, alpha_cutoff, double_sided: as in glTF. detail: width
+    of the source's finest detail in the normalised frame. It is the least of: a texel of the textures, half a pixel of
+    the views, a pixel of the picture that the views were generated from, and without textures half an edge of the mesh.
     """
 
     source: Source
@@ -80,10 +80,10 @@ def from_surface(
     field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
     picture: Picture | None = None,
 ) -> Origin:
-    """Prepare a surface: views give material and normals where they see it well, its vertices elsewhere.
+    """Prepare a surface: materials and normals come from views where these see it well, elsewhere from its vertices.
 
-    field (material_field) replaces the vertices for materials that the views lack. picture: the one that the views were
-    generated from, for its finer detail.
+    field (see material_field) replaces the vertices for the materials that no view has. picture: the one that the views
+    were generated from; it adds finer detail.
     """
     source = Source(TriMesh(surface.vertices, surface.faces))
     normals = (
@@ -121,7 +121,7 @@ def from_surface(
 def _with_field(
     lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]
 ) -> Lookup:
-    """Make a lookup that takes the named materials from a field, the rest from lookup."""
+    """Make a lookup that takes the named materials from a field, and the others from `lookup`."""
 
     def with_field(places: Places) -> dict[str, np.ndarray]:
         read = field(source.at(places.face_idx, places.barycentric, source.vertices))
@@ -131,12 +131,15 @@ def _with_field(
 
 
 def _views_are_finer(views: Views, source: Source) -> bool:
-    """Tell whether view normals can hold more detail: a pixel spans at most 1.5 times the surface's typical edge."""
+    """Return whether the views' normals can hold more detail than the surface's vertices.
+
+    They can where a pixel spans at most 1.5 times the surface's median edge.
+    """
     return _view_pixel(views) <= 1.5 * _edge(source)
 
 
 def _edge(source: Source) -> float:
-    """Measure the median edge length of the source's triangles."""
+    """Compute the median edge length of the source's triangles."""
     corners = source.vertices[source.faces]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
@@ -148,9 +151,9 @@ def _view_pixel(views: Views) -> float:
 
 
 def texture_detail(scene: Scene) -> float | None:
-    """Measure the width of a texel of a scene's finest textures on its surface, in the scene's units.
+    """Measure the width on the surface of a texel of the finest textures, in the scene's units.
 
-    The median over the textured area; None where nothing is textured.
+    This is the median over the textured area; None where no face has a texture.
     """
     from gdtool.geometry.normals import face_normals
 
@@ -190,10 +193,10 @@ def texture_detail(scene: Scene) -> float | None:
 def from_scene(
     scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0
 ) -> Origin:
-    """Prepare a textured model in its file's frame; source_from_world (4, 4) maps the normalised frame to it.
+    """Prepare a textured model, given in its file's frame; source_from_world (4, 4) maps the normalised frame to it.
 
-    footprint(detail) is the width, in the normalised frame, over which the textures are averaged where they are read;
-    detail is the model's (see Origin).
+    footprint: from the model's detail (see Origin), the width over which textures are averaged where they are read.
+    Both are in the normalised frame.
     """
     from gdtool.shading.render.surface_points import SurfaceLookup
 

@@ -36,7 +36,10 @@ class Gutters:
             self._weights.append(weight)
 
     def fill(self, channel: np.ndarray, background: float | None = None) -> np.ndarray:
-        """Fill a channel (h, w) float32, 0 outside the mask, in place; background replaces the mean. Returns it."""
+        """Fill a channel (h, w) float32 in place and return it; it has to be 0 outside the mask.
+
+        Far texels get `background` instead of the channel's mean, where it is given.
+        """
         if not self._weights:
             return channel
         if self._far is not None and background is None:

@@ -1,4 +1,4 @@
-"""Find, for points of the baked mesh, the places on the source surface that they stand for."""
+"""Find the point of the source surface that corresponds to each point of the baked mesh."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ _MOST_CUT = 100_000
 
 
 class Nearest:
-    """Find closest points on some faces of a mesh; keeps the search tree, which libigl builds on each call otherwise.
+    """Find closest points on faces of a mesh.
 
-    chosen (m,): indices of the faces to look among; None is all.
+    Keeps the search tree, which libigl otherwise builds on each call. chosen (m,): indices of the faces to search; None
+    searches all.
     """
 
     def __init__(self, mesh: TriMesh, chosen: np.ndarray | None = None):
@@ -54,9 +55,9 @@ class Nearest:
 
 
 class Source:
-    """Triangles to bake from, with their ray caster and search trees.
+    """The triangles to bake from, with their ray caster and search trees.
 
-    vertices (v, 3) float64, faces (f, 3), face_normals (f, 3) unit; extent: longest side of the bounding box.
+    mesh: vertices (v, 3), faces (f, 3). face_normals (f, 3) unit; extent: longest side of the bounding box.
     """
 
     def __init__(self, mesh: TriMesh):
@@ -72,12 +73,12 @@ class Source:
         self._lock = Lock()
 
     def normals_of(self, face_idx: np.ndarray) -> np.ndarray:
-        """Gather unit normals (n, 3) float32 of faces, each component side by side in memory."""
+        """Gather unit normals (n, 3) float32 of faces; each component is contiguous in memory."""
         return np.take(self._normal_rows, face_idx, axis=1).T
 
     @cached_property
     def twins(self) -> np.ndarray:
-        """Index (f,) int32 of the face with the same corners that faces the other way, -1 where there is none."""
+        """Find for each face the one with the same corners that faces the other way: (f,) int32, -1 without one."""
         corners = np.sort(number_distinct_rows(self.vertices)[self.faces], axis=1)
         order = np.lexsort(corners.T)
         first, second = order[:-1], order[1:]
@@ -99,7 +100,7 @@ class Source:
     def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
         """Flip all face normals if the source is inside out, and return whether it was.
 
-        It is when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
+        It counts as inside out when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
         """
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
@@ -116,10 +117,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Places:
-    """Places on a source.
+    """Points on a source's surface.
 
-    face_idx (n,), barycentric (n, 3) float32; by_ray (n,) bool, False where the nearest point was taken; from_behind
-    (n,) bool, whether the back of the face is meant.
+    face_idx (n,), barycentric (n, 3) float32. by_ray (n,) bool: found by a ray along the normal; False where the
+    nearest point was taken. from_behind (n,) bool: whether the back of the face is seen.
     """
 
     face_idx: np.ndarray
@@ -129,10 +130,11 @@ class Places:
 
 
 def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
-    """Compute how far from each triangle to look for the source, (t,): the offset of its cage.
+    """Compute how far from each triangle to look for the source: (t,), the offset of its baking cage.
 
-    This is twice the largest distance of its corners to the source, plus a share of its size for the bulge between
-    them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a part.
+    This is twice the largest distance of the triangle's corners to the source, plus a share of its size for the bulge
+    between them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a
+    part.
     """
     vertices, faces = mesh.vertices, mesh.faces
     distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
@@ -144,9 +146,9 @@ def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
 
 
 class _Hits(NamedTuple):
-    """Where n rays meet the source: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3).
+    """Hits of n rays on the source: face_idx (n,), -1 without a hit, distance (n,), barycentric (n, 3).
 
-    behind (k,): the rays that stopped at a face met from behind.
+    behind (k,): indices of the rays that stopped at the back of a face.
     """
 
     face_idx: np.ndarray
@@ -164,10 +166,10 @@ def _march(
     start: float,
     through: bool = True,
 ) -> _Hits:
-    """Find the first face on the right side along each ray, within reach.
+    """Find the first face along each ray, within reach (n,), whose normal agrees with normals (n, 3).
 
-    Rays begin `start` before their points. They step through faces on the wrong side. Without `through`, a ray whose
-    first face is met from behind stops there: it has that face, a distance of infinity, and is listed in behind.
+    Rays begin `start` before their points, and pass through faces that do not agree. If not `through`, a ray whose
+    first face is seen from behind stops there. It gets that face and the distance infinity, and is listed in `behind`.
     """
     face, t, barycentric = source.caster.first_hit_single(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
@@ -199,10 +201,10 @@ def _march(
 def _nearest_agreeing(
     points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest place whose face agrees with the normal: face_idx (n,), point (n, 3).
+    """Find the nearest point of the source whose face agrees with the normal: face_idx (n,), point (n, 3).
 
-    The plain nearest place is taken where none agrees. It is also taken where it lies within reach (n,) and no place
-    that agrees does: then it is the back of a one-sided sheet.
+    Where no face agrees, the nearest point of all is taken. It is also taken where it lies within reach (n,) and the
+    nearest agreeing point does not: the surface there is the back of a one-sided sheet.
     """
     face, point = source.nearest.closest(points)
     wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
@@ -228,10 +230,11 @@ def _nearest_agreeing(
 def _slide_off_edges(
     points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> None:
-    """Take the nearest place, if it agrees, where a ray met a slanted face far away; changes face and barycentric.
+    """Replace a ray's hit by the nearest point, where the hit face is slanted and the two are far apart.
 
-    At a crease that remeshing cut off, the normal leads past the edge, to a place well away from the nearest one. met
-    (n,) bool: which points' places come from rays.
+    At a crease that remeshing cut off, the normal leads past the edge, to a point well away from the nearest one. The
+    nearest point has to agree with the normal. met (n,) bool: the points whose places come from rays. Changes face (n,)
+    and barycentric (n, 3).
     """
     cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
@@ -249,7 +252,10 @@ def _slide_off_edges(
 
 
 def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Move places (k,) on a face with a twin (Source.twins) to the twin; changes face and barycentric."""
+    """Move places from faces with a twin (Source.twins) to the twin; changes face (n,) and barycentric (n, 3).
+
+    places (k,): the rows of face and barycentric to move.
+    """
     if not len(places):
         return
     twin = source.twins[face[places]]
@@ -259,10 +265,10 @@ def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric
 
 
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
-    """Find where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
+    """Find the places on the source of points (n, 3) with unit normals (n, 3) of the baked mesh.
 
-    A ray goes along the normal, outward and inward, within reach (n,). The nearest face that faces the same way is
-    taken. Where the ray meets none, the nearest such place in any direction is taken. So nothing is read from the other
+    Rays go along the normal, outward and inward, within reach (n,). The nearest face that faces the same way is taken.
+    Where neither ray meets one, the nearest such point in any direction is taken. So nothing is read from the other
     side of a thin wall. A one-sided sheet is read from behind, and nothing is read through it.
     """
     start = 2e-5 * source.extent

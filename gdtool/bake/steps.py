@@ -28,11 +28,12 @@ Report = dict[str, bool | int | float | str]
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Choose what to bake, and how to store it.
+    """Options of a bake and of storing its maps.
 
-    size, samples: of the maps, None where the source's detail decides (target.fineness). occlusion_rays per traced
-    point, drawn by seed; 0: no ambient occlusion. height, confidence: make these maps too. bits per channel. padding in
-    texels; 0: all that are free. normal_map: "auto" leaves a flat one out.
+    size: side of the maps in texels; samples: per texel; None chooses either by the source's detail (target.fineness).
+    occlusion_rays: per traced point, with directions drawn from `seed`; 0 bakes no ambient occlusion. height,
+    confidence: whether to make these maps too. bits: 8 or 16 per channel. padding: width of gutters in texels; 0 fills
+    all free texels. normal_map: "auto" leaves a flat one out.
     """
 
     size: int | None
@@ -49,9 +50,9 @@ class StepOptions:
 def read_source(
     source: Source, choice: SourceChoice, target: Target, matrix: np.ndarray, name: str, out: Output
 ) -> Origin:
-    """Read the surface or model to bake from, and warn where it is inside out beside the target.
+    """Read the surface or model to bake from, and warn where it is inside out compared with the target.
 
-    source is what the mesh was read from; matrix (4, 4) maps the normalised frame to the model's.
+    source: what the mesh was read from; matrix (4, 4): from the normalised frame to the model's.
     """
     origin, turned = read_origin(source, choice, target, matrix)
     for what, why in choice.skipped:
@@ -83,7 +84,10 @@ def rasterise(
 def bake_maps(
     target: Target, texels: Texels, origin: Origin, samples: int, options: StepOptions, out: Output
 ) -> tuple[Maps, Report]:
-    """Bake the texels' values and occlusion, and make maps of them; also returns the report."""
+    """Bake the texels' values and ambient occlusion, and make maps of them.
+
+    Returns the maps and the report's figures.
+    """
     with out.step("bake"):
         reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
         how = BakeOptions(samples, out.threads, options.height, options.confidence)
@@ -115,7 +119,7 @@ def bake_maps(
 
 
 def add_levels(target: Target, count: int, report: Report, out: Output) -> tuple[Target, ...]:
-    """Make coarser levels of detail until there are `count` with the full one, and add their figures to the report."""
+    """Make coarser levels of detail, `count` with the full mesh, and add their figures to the report."""
     if count < 2:
         return ()
     with out.step("levels of detail"):

@@ -20,7 +20,10 @@ _ROWS_AT_ONCE = 64
 def varying(
     texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE
 ) -> np.ndarray:
-    """Find the texels (m,) that differ in a stored value by more than tolerance from one of eight neighbours."""
+    """Find the texels (m,) with a value that differs from one of the eight neighbours' by more than `tolerance`.
+
+    Values are compared as maps store them.
+    """
     from gdtool.images.color import srgb_from_linear
 
     size, mask = texels.size, texels.mask()
@@ -65,12 +68,12 @@ def supersample(
     samples: int,
     threads: int = 1,
 ) -> float:
-    """Replace the values (n, …) of varying texels by means over several samples; changes values.
+    """Replace the values (n, …) of varying texels by means over several samples; changes `values`.
 
-    samples is a square number. read(face_idx, barycentric) gives the same values at any places on the target. A sample
-    is read in the triangle that covers its place, and does not count where none does. So a texel gets the mean over the
-    part of it that charts cover; one without a covered sample keeps its value. Color is weighted by alpha, and
-    tangent_normal is made unit again. Returns the share of texels that vary.
+    samples: per texel, a square number. read(face_idx, barycentric) returns values by name at points of the target.
+    Each sample is read in the triangle that covers it; a sample that no triangle covers is left out. So a texel gets
+    the mean over the part of it that charts cover. A texel without a covered sample keeps its value. Color is weighted
+    by alpha, and tangent_normal is scaled to unit length. Returns the share of texels that vary.
     """
     side, size, chosen = int(round(samples**0.5)), texels.size, varying(texels, values, threads)
     barycentrics, texel = Barycentrics(target.uv, target.face_uvs), texels.texel[chosen]
@@ -102,10 +105,10 @@ def supersample(
 def _means(
     taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Average samples of `count` texels: returns the texels that have any (m,), and their means (m, …) by name.
+    """Average samples of `count` texels: returns the texels with any sample (m,), and the means (m, …) by name.
 
-    taken yields, for the first sample of all texels, then the second and so on, the texels (k,) that have it and the
-    values read there. like names the values.
+    taken: yields once for each sample position in a texel: the texels (k,) that are covered there, and their values (k,
+    …) by name. like: values with the names and shapes to average.
     """
     total = {name: np.zeros((count, *value.shape[1:]), np.float32) for name, value in like.items()}
     samples, shown = np.zeros(count, np.float32), np.zeros(count, np.float32)

@@ -56,7 +56,7 @@ def corner_normals(mesh: TriMesh, crease_degrees: float = CREASE_DEGREES) -> np.
 
 
 class SurfaceModes(Protocol):
-    """How viewers show a surface; bake.origin.Origin is one."""
+    """The glTF material settings alpha mode, alpha cutoff and double-sided; bake.origin.Origin has them."""
 
     alpha_mode: str
     alpha_cutoff: float
@@ -102,7 +102,7 @@ class Target:
 
     @cached_property
     def packed(self) -> np.ndarray:
-        """Corners of the triangles as (3, 10, t) float32: position, normal, tangent and its handedness."""
+        """Gather the corners of the triangles as (3, 10, t) float32: position, normal, tangent and its handedness."""
         corners = np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1)
         return np.ascontiguousarray(corners.transpose(1, 2, 0), np.float32)
 
@@ -125,13 +125,13 @@ class Texels:
         return len(self.texel)
 
     def mask(self, inside_only: bool = False) -> np.ndarray:
-        """Make an image (size, size) bool of these texels."""
+        """Make an image (size, size) bool that is True at these texels."""
         out = np.zeros(self.size * self.size, bool)
         out[self.texel[: self.inside] if inside_only else self.texel] = True
         return out.reshape(self.size, self.size)
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        """Make an image (size, size, …) of values (n, …) of these texels, fill elsewhere."""
+        """Make an image (size, size, …) of values (n, …) of these texels; other texels are `fill`."""
         out = np.zeros((self.size * self.size, *values.shape[1:]), values.dtype)
         if fill:
             out[:] = fill
@@ -171,7 +171,7 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
 def surface_at(
     target: Target, face_idx: np.ndarray, barycentric: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Interpolate positions, normals, tangents (n, 3) and handedness (n,) at places on the target, float32.
+    """Interpolate positions, normals, tangents (n, 3) and handedness (n,) at points of the target, float32.
 
     Normals and tangents are not made unit, as viewers interpolate them (see tangents.tangent_frames). Each component is
     contiguous in memory, so that sums over components are fast.
@@ -191,7 +191,10 @@ def surface_at(
 
 
 def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate positions (n, 3) and tangent frames (n, 3, 3), columns tangent, bitangent, normal."""
+    """Interpolate positions (n, 3) and tangent frames (n, 3, 3) at points of the target.
+
+    The columns of a frame are tangent, bitangent and normal.
+    """
     points, normal, tangent, sign = surface_at(target, face_idx, barycentric)
     return points, tangent_frames(normal, tangent, sign)
 
@@ -205,15 +208,19 @@ def texel_width(target: Target, size: int) -> float:
 
 
 def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) -> int:
-    """Choose the power of two at which a texel spans at most 1.1 detail (in the target's units), within bounds."""
+    """Choose the side of the maps: the least power of two whose texels span at most 1.1 `detail`, within bounds.
+
+    detail: width of the source's finest detail, in the target's units.
+    """
     wanted = texel_width(target, 1) / max(detail, 1e-9) / 1.1
     return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))
 
 
 def fineness(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
-    """Choose the size of the maps, and the samples of a texel where the source varies, for a source of that detail.
+    """Choose the side of the maps in texels, and the samples per texel where the source varies.
 
-    A given size or number of samples is kept, samples rounded to a square number.
+    detail: width of the source's finest detail, in the target's units. A size or number of samples that is not None is
+    kept; samples are rounded to a square number.
     """
     size = size or size_for(target, detail)
     if samples is None:
@@ -222,5 +229,8 @@ def fineness(target: Target, detail: float, size: int | None, samples: int | Non
 
 
 def samples_for(width: float, detail: float) -> int:
-    """Choose the samples of a texel of some width where a source with detail of some width varies, in one unit."""
+    """Choose the samples per texel: 4 where a texel is more than COARSE_TEXEL times as wide as the detail, else 1.
+
+    width, detail: both in the same unit.
+    """
     return 4 if width > COARSE_TEXEL * detail else 1

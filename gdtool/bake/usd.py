@@ -79,7 +79,7 @@ def write_usd(
 
 
 def _material(stage, maps: Maps, files: dict[str, str], convention: str, modes: SurfaceModes):
-    """Define a UsdPreviewSurface, with a texture for each map and plain values where a map is constant."""
+    """Define a UsdPreviewSurface with a texture for each map, and with plain values where a map is constant."""
     from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
