@@ -13,7 +13,7 @@ _MAX_PIECES = 1000  # more pieces stay where they are: all pairs of boxes are co
 
 
 class SeparatedPieces:
-    """A mesh whose pieces were moved apart."""
+    """A mesh whose pieces were moved apart, and the way back to where they were."""
 
     def __init__(self, mesh: TriMesh, piece: np.ndarray, offset: np.ndarray):
         """piece (f,): the piece of each face. offset (pieces, 3): how far each piece moves."""

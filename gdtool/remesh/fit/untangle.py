@@ -35,10 +35,10 @@ def untangle(
 ) -> np.ndarray:
     """Move vertices of folded and needle-like quads to the best of a few positions near them.
 
-    A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, improves. Free
-    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it. max_visits
-    bounds the work by a count, not a time, so that equal input gives equal output. Vertices that share no quad move at
-    once. Returns vertices (v, 3).
+    A vertex moves only where that improves the worst scaled Jacobian of its quads, measured against the surface's
+    normals. Free vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it.
+    max_visits bounds the work by a count, not a time, so that equal input gives equal output. Vertices that share no
+    quad move at once. Returns vertices (v, 3).
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
@@ -89,7 +89,10 @@ def untangle(
 def _batch_positions(
     vertices: np.ndarray, batch: np.ndarray, faces: np.ndarray, face_lists: GroupedLists, neighbour_lists: GroupedLists
 ) -> np.ndarray:
-    """Return (n, _POSITIONS, 3) positions for a batch, computed together for vertices with equally many neighbours."""
+    """Compute positions (n, _POSITIONS, 3) that a batch of vertices (n,) may move to.
+
+    Vertices with equally many faces and neighbours are computed together.
+    """
     size = np.stack([face_lists.lengths(batch), neighbour_lists.lengths(batch)], -1)
     positions = np.empty((len(batch), _POSITIONS, 3))
     for alike in {tuple(lengths) for lengths in size.tolist()}:
@@ -116,7 +119,7 @@ def _independent_batches(chosen: np.ndarray, faces: np.ndarray, face_lists: Grou
 def _candidate_positions(
     vertices: np.ndarray, batch: np.ndarray, quads: np.ndarray, neighbour_idx: np.ndarray
 ) -> np.ndarray:
-    """Return (n, _POSITIONS, 3) positions that vertices (n,) may move to; the first is where they are.
+    """Compute the positions (n, _POSITIONS, 3) that vertices (n,) may move to; the first is where they are.
 
     quads (n, k, 4) and neighbours (n, m) around them.
     """
@@ -148,7 +151,7 @@ def _best_position(
     """Choose for each vertex the position that makes the worst quad around it best.
 
     quads (n, k, 4) around the vertices, normals (n, k, 3) of the surface under them, positions (n, p, 3). Returns the
-    index of the best position (n,) and (n,) bool whether it is better than to stay.
+    index (n,) of the best position, and (n,) bool: whether it is better than the present one.
     """
     n, p, k = *positions.shape[:2], quads.shape[1]
     corners = np.where(
