@@ -183,7 +183,7 @@ class EngineSearch:
         return alike
 
     def _reject(self, taken: Candidate) -> None:
-        """Record why a fitted candidate is rejected; keep it if it passes the limits for results without subdivision."""
+        """Record why a fitted candidate is rejected; keep it if it passes the limits of results without subdivision."""
         if taken.acceptable_as_finer and self.patch.has_count(taken.fitted_count, self.patch.quads):
             self._acceptable = taken
         self._fail(taken.attempt, f"{taken.fault}; {taken.rejection}" if taken.fault else taken.rejection)
@@ -233,10 +233,9 @@ class EngineSearch:
         return [second, first, *others] if swap else candidates
 
     def _with_right_count(self, candidates: list[Candidate], tip_quads: int) -> Iterator[Candidate]:
-        """Yield the candidates whose count, tips included, is the wanted one, and the hopeless ones
-        (SnappedQuads.hopeless).
+        """Yield the candidates whose count, tips included, is the wanted one, and the hopeless ones.
 
-        tip_quads: the quads that tips are expected to add, until a candidate is snapped.
+        Hopeless: see SnappedQuads. tip_quads: the quads that tips are expected to add, until a candidate is snapped.
         """
         quads = self.patch.quads
         for candidate in candidates:
@@ -301,8 +300,7 @@ class EngineSearch:
                 self._skipped_engines.add(attempt.engine)
 
     def _finalize_acceptable(self) -> QuadResult | None:
-        """Finalize the subdivided result that passes only the limits for results without subdivision; None if none
-        does."""
+        """Finalize the subdivided result that passes only the limits of results without subdivision; None if none."""
         return None if self._acceptable is None else self._finalized(self._acceptable)
 
     def _finalize_bridged(self) -> QuadResult | None:
