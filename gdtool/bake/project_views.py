@@ -23,7 +23,7 @@ REFERENCE_GAIN = 4.0
 
 @dataclass(frozen=True)
 class ViewVisibility:
-    """What one camera sees of the surface, for each pixel of its image.
+    """The depths and silhouettes of a surface in one camera's image, for each pixel.
 
     nearest, farthest (h, w): depths of the pixel's nearest and farthest sample; inf and -inf where all miss.
     edge_distance (h, w): pixels to the nearest silhouette or depth step, at least 0.5.

@@ -69,7 +69,7 @@ class Request:
 
     @property
     def fallback_seconds(self) -> float:
-        """Return the seconds for steps that a result needs: what is left of `seconds`, at least _MIN_FALLBACK_SECONDS."""
+        """Return the seconds for the steps that a result needs: what is left, but at least _MIN_FALLBACK_SECONDS."""
         return max(self.started + self.seconds - time.monotonic(), _MIN_FALLBACK_SECONDS)
 
 

@@ -1,4 +1,4 @@
-"""Coarser levels keep the texture coordinates of what they stand for."""
+"""Coarser levels of detail keep the texture coordinates of the full mesh."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ def target():
     return Target.of(TriMesh(vertices, faces), *unwrapped(vertices, faces, 256))
 
 
-def test_a_level_has_the_triangles_asked_for_and_stays_on_its_texels():
+def test_a_level_has_the_requested_triangles_and_keeps_its_texels():
     full = target()
     same = drift(full, full)
     assert same["drift_p99"] < 2e-3
@@ -53,7 +53,7 @@ def _span(full):
     return texel_width(full, 1)
 
 
-def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
+def test_a_level_that_drifts_on_its_maps_is_left_out(monkeypatch):
     full = target()
     # A level whose texture corners are those of the opposite side.
     half, _ = coarser(full, len(full.faces) // 2)
@@ -67,7 +67,7 @@ def test_a_level_that_slides_on_its_maps_is_left_out_and_named(monkeypatch):
     assert "slide" in made.skipped[0][1]
 
 
-def test_a_level_that_seams_keep_from_its_count_stays_where_it_is_coarser_than_the_last(monkeypatch):
+def test_a_level_with_too_many_triangles_is_kept_if_coarser_than_the_last(monkeypatch):
     full = target()
     count = len(full.faces)
     levels = {

@@ -1,4 +1,4 @@
-"""What becomes a map, what a factor, and what is left out."""
+"""What is stored as a map, what as a factor, and what is left out."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from gdtool.geometry.uv_raster import rasterize_uv
 
 @pytest.fixture
 def texels():
+    """Rasterise a square chart into a map of 64 x 64."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.2, 0.8], [0.8, 0.8], [0.8, 0.2], [0.2, 0.2]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -19,6 +20,7 @@ def texels():
 
 
 def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(0.0, 0.0, 1.0)):
+    """Make values of texels, constant over all of them."""
     n = len(texels)
     fill = lambda v: np.ascontiguousarray(np.broadcast_to(np.asarray(v, np.float32), (n, *np.shape(v))))  # noqa: E731
     return {
@@ -46,7 +48,7 @@ def test_constants_become_factors(texels):
     assert contact_sheet_of(maps).dtype == np.uint8
 
 
-def test_orm_packs_as_gltf_says_and_a_constant_channel_stays_a_factor(texels):
+def test_orm_is_packed_as_in_gltf_and_a_constant_channel_is_a_factor(texels):
     given = values(texels)
     given["roughness"] = np.linspace(0.2, 0.8, len(texels), dtype=np.float32)
     occlusion = np.full(len(texels), 0.5, np.float32)
@@ -83,7 +85,7 @@ def test_alpha_is_kept_and_opaque_alpha_dropped(texels):
 
 @pytest.mark.parametrize("least", [0.5 / 255, 0.5])
 def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
-    """Leaves are cut out of black: under no alpha, or under less than the cutoff, the color around is stored."""
+    """Leaves cut out of black: texels with alpha below the limit are stored in the color of their surroundings."""
     given, hidden = values(texels), np.arange(len(texels)) % 5 < 2
     given["albedo"][:] = (0.2, 0.5, 0.3)
     given["albedo"][hidden] = 0
@@ -98,7 +100,7 @@ def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
     assert at[hidden][:, :3].max() == 0
 
 
-def test_normal_map_only_where_it_says_something(texels):
+def test_a_normal_map_is_stored_only_where_it_is_not_flat(texels):
     tilt = lambda degrees: (np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees)))  # noqa: E731
     assert make_maps(texels, values(texels, normal=tilt(0.8))).normal is None
     assert make_maps(texels, values(texels, normal=tilt(0.8)), options=MapOptions(normal_map="on")).normal is not None
@@ -110,7 +112,7 @@ def test_normal_map_only_where_it_says_something(texels):
     assert flat_angle(np.tile(tilt(3), (9, 1))) == pytest.approx(3)
 
 
-def test_directx_turns_green_only():
+def test_directx_inverts_green_only():
     image = np.array([[[10, 20, 30]]], np.uint8)
     np.testing.assert_array_equal(directx(image), [[[10, 235, 30]]])
     np.testing.assert_array_equal(directx(directx(image)), image)

@@ -67,7 +67,7 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
     assert (baked.values["tangent_normal"][:, 2] > 0.7).all()
 
 
-def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake):
+def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus_bake):
     target, texels, source, _, reach, _ = torus_bake
 
     # Above the middle stripes finer than a texel, whose mean is one half; below it one half everywhere.
@@ -113,7 +113,7 @@ def test_thin_wall_does_not_bleed_through():
 
 
 def test_a_chart_smaller_than_a_texel_has_its_own_color():
-    """A blue triangle that covers no texel's centre, beside the chart of a red square: its lookups are blue."""
+    """A blue triangle whose chart covers no texel's centre, beside the chart of a red square: its lookups are blue."""
     vertices = np.array(
         [
             [-0.5, 0, -0.5],
@@ -142,7 +142,7 @@ def test_a_chart_smaller_than_a_texel_has_its_own_color():
     np.testing.assert_array_equal(image[7:31, 7:31], np.broadcast_to([255, 0, 0], (24, 24, 3)))
 
 
-def test_every_covered_texel_is_read_and_ring_texels_continue_it(torus_bake):
+def test_every_covered_texel_is_read_and_ring_texels_continue_the_chart(torus_bake):
     target, texels, _, _, _, baked = torus_bake
     owner, _ = rasterize_uv(target.uv, target.face_uvs, 256)
     np.testing.assert_array_equal(texels.mask(inside_only=True), owner >= 0)

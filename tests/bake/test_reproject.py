@@ -1,4 +1,4 @@
-"""Points of a baked mesh find their place on the source, on the right side of walls."""
+"""Points of a baked mesh find their places on the source, on the right side of walls."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from tests.bake.shapes import sphere, torus, triangles_of
 
 
 def box(size):
-    """A closed box centred at the origin: vertices (8, 3), faces (12, 3)."""
+    """Make a closed box centred at the origin: vertices (8, 3), faces (12, 3)."""
     x, y, z = np.array(size) / 2
     vertices = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (-z, z)])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -16,6 +16,7 @@ def box(size):
 
 
 def at(source, places):
+    """Compute the positions (n, 3) of places on a source."""
     return source.at(places.face_idx, places.barycentric, source.vertices)
 
 
@@ -47,7 +48,7 @@ def test_thin_wall_is_never_crossed():
             np.testing.assert_allclose(at(source, places)[:, :2], xy, atol=3e-7)  # weights of the corners are float32
 
 
-def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():
+def test_the_nearest_point_on_its_side_is_taken_where_the_normal_misses():
     vertices, faces = box((1.0, 1.0, 0.001))
     source = Source(TriMesh(vertices, faces))
     # Beside the plate: the normal meets nothing, the other side's rim is as near.
@@ -69,7 +70,7 @@ def test_reach_covers_the_distance_but_not_the_object():
     assert reach.max() < 0.08
 
 
-def test_a_sheet_without_another_side_is_read_from_behind():
+def test_a_one_sided_sheet_is_read_from_behind():
     # A square at z = 0 that looks along +z, and a floor far below its middle that looks the way its back does not.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -87,7 +88,7 @@ def test_a_sheet_without_another_side_is_read_from_behind():
     np.testing.assert_allclose(at(source, places)[:, 2], -0.3, atol=1e-6)
 
 
-def test_a_sheet_is_not_looked_through():
+def test_nothing_is_read_through_a_one_sided_sheet():
     # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands
     # for.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
@@ -104,7 +105,7 @@ def test_a_sheet_is_not_looked_through():
         assert places.by_ray.all()
 
 
-def test_of_two_faces_back_to_back_the_one_that_looks_the_same_way_is_read():
+def test_of_two_faces_back_to_back_the_agreeing_one_is_read():
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     front = np.array([[0, 1, 2], [0, 2, 3]])
     rng = np.random.default_rng(4)

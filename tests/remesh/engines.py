@@ -11,12 +11,12 @@ from gdtool.remesh.engines import search
 
 
 def whole(faces) -> bool:
-    """All quads, watertight and manifold."""
+    """Return whether all faces are quads, watertight and manifold."""
     return faces.min() >= 0 and topology.is_watertight(faces) and topology.is_manifold(faces)
 
 
 class Ended:
-    """A child that has ended, in the place of one that works."""
+    """A child process that has ended with a result or a failure."""
 
     def __init__(self, outcome):
         self.outcome = outcome
@@ -31,8 +31,10 @@ class Ended:
 
 
 def in_this_process(monkeypatch, engine=None) -> list:
-    """Candidates are made here, by `engine` in the place of every engine where one is given; the calls, as they
-    come."""
+    """Make candidates in this process instead of in children; return the list of calls, filled as they come.
+
+    engine: replaces every engine, unless it is None.
+    """
     calls = []
 
     def begin(_, *given, **limits):
@@ -49,12 +51,12 @@ def in_this_process(monkeypatch, engine=None) -> list:
 
 
 def around(faces, middle) -> tuple[np.ndarray, np.ndarray]:
-    """The faces that touch face `middle` at one corner only, and those that share an edge with it."""
+    """Find the faces that touch face `middle` at one corner only, and those that share an edge with it."""
     shared = np.isin(faces, faces[middle]).sum(1)
     return np.flatnonzero(shared == 1), np.flatnonzero(shared == 2)
 
 
 def inner_face(vertices, faces) -> int:
-    """A face in the middle of a side of a cube."""
+    """Find a face in the middle of a cube's side."""
     centre = vertices[faces].mean(1)
     return int(np.linalg.norm(centre - [0.07, 0.07, centre[:, 2].max()], axis=1).argmin())

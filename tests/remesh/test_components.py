@@ -1,4 +1,4 @@
-"""Meshes of several pieces: none is lost, each has its share."""
+"""Meshes of several pieces: none is lost, and each has its share of the quads."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from tests.remesh.engines import in_this_process, whole
 
 
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
-    """Each has its share of the quads asked for, the small one enough for its shape, and none is lost."""
+    """Each gets its share of the quads requested, and the small one enough for its shape."""
     vertices, faces = joined(sphere(48, 0.4, (0, -0.2, 0)), sphere(48, 0.12, (0, 0.5, 0)))
     both = RemeshPatch(TriMesh(vertices, faces), 4000, 0.03, Request(), None)
     assert components.accept_good_pieces(both, None)[0] is None
@@ -49,8 +49,8 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
 
 
 @pytest.mark.parametrize("hopeless", [False, True])
-def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless):
-    """Of more than go one by one; where one of them fails, too, whatever is tried, it alone is paired triangles."""
+def test_good_pieces_of_an_engines_result_are_kept(monkeypatch, hopeless):
+    """There are more pieces than are remeshed one by one. If engines fail on one, that one alone is paired triangles."""
     ball, large = sphere(64, 0.09), sphere(48, 0.3)
     balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))
@@ -79,9 +79,8 @@ def test_of_many_pieces_those_that_came_out_well_are_kept(monkeypatch, hopeless)
 
 
 @pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
-def test_pieces_are_kept_as_they_were_drawn_where_the_others_can_make_up_for_their_count(monkeypatch, wanted, kept):
-    """Two balls of which an engine's quads are those of both: all are kept, or none where there are a sixth too few;
-    none is drawn again."""
+def test_fitted_pieces_are_accepted_if_the_others_can_make_up_for_their_count(monkeypatch, wanted, kept):
+    """Two balls with good quads are both accepted, or neither if there are a sixth too few; neither is fitted again."""
     meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
     made = components.concatenate_meshes(
         [pipeline.remesh(TriMesh(*mesh), Request(quads=500, engine="split"))[0] for mesh in meshes]
@@ -110,8 +109,8 @@ def test_small_piece_is_not_lost():
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
 
-def test_pieces_of_a_few_quads_each_are_not_given_to_an_engine(monkeypatch):
-    """Twenty boxes of about eight quads each beside a ball: an engine sees the ball alone."""
+def test_tiny_pieces_skip_engines(monkeypatch):
+    """Twenty boxes of about eight quads each beside a ball: the engine gets the ball alone."""
     vertices, faces = cube(0.02)
     vertices, faces = joined(sphere(48, 0.4), *((vertices + (0.45, 0.05 * k - 0.5, 0), faces) for k in range(20)))
     tried, run = [], search.EngineSearch.run
@@ -128,7 +127,7 @@ def test_pieces_of_a_few_quads_each_are_not_given_to_an_engine(monkeypatch):
 
 
 def test_the_count_holds_where_small_pieces_take_more_than_their_share():
-    """A tray of ten triangles comes out of the fallback as two dozen quads however few are asked for."""
+    """A tray of ten triangles becomes two dozen quads in the fallback, however few are requested."""
     corners = np.stack(np.meshgrid(*[np.arange(5)] * 3, indexing="ij"), -1).reshape(-1, 3)[:100]
     vertices, faces = cube(0.01)
     trays = [(vertices + 0.05 * corner + 0.3, faces[:-2]) for corner in corners]

@@ -1,4 +1,4 @@
-"""Creases are where the surface turns, not where simplifying has folded a sliver over."""
+"""Features: creases are where the surface turns, not where simplifying folded a sliver over."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,10 @@ FACES = np.array([(0, 1, 4), (1, 2, 4), (0, 4, 2), (0, 2, 3)])
 
 
 def square(turned_degrees: float) -> np.ndarray:
-    """A square of two halves that turn about the diagonal 0-2, and vertex 4 past the diagonal, so that (0, 4, 2) is a
-    folded sliver."""
+    """Make a square of two halves, one turned about the diagonal 0-2.
+
+    Vertex 4 lies past the diagonal, so that (0, 4, 2) is a folded sliver.
+    """
     angle = np.radians(turned_degrees)
     along, side = np.array([1, 1, 0]) / 2**0.5, np.array([-1, 1, 0]) / 2**0.5
     tip = along / 2**0.5 + (side * np.cos(angle) + np.array([0, 0, 1]) * np.sin(angle)) / 2**0.5
@@ -39,7 +41,7 @@ def test_a_crease_beside_a_sliver_is_kept():
     assert at[1, 4] < 1e-5
 
 
-def test_corners_in_a_row_are_not_all_drawn_into_one():
+def test_corners_in_a_row_are_not_all_contracted_into_one():
     """A comb: teeth an edge apart stand on a spine of arcs that are all too short to follow."""
     teeth, length, short = 21, 10, 1.5
     points = np.array([(x, y, 0.0) for x in range(teeth) for y in range(length)])
@@ -62,8 +64,7 @@ def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("thickness", [0.005, 0.014])
 def test_both_rims_of_a_thin_plate_are_kept(thickness):
-    """Its short edges are half a quad or more than one long; drawn together they would bend the rims by their whole
-    length."""
+    """Contracting the plate's short edges would bend its rims by as much."""
     vertices, faces = plate(thickness)
     found = find_features(TriMesh(vertices, faces), 30.0, 0.03)
     length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
@@ -73,9 +74,8 @@ def test_both_rims_of_a_thin_plate_are_kept(thickness):
     assert found.share_in_strips(thickness / 2) == 0
 
 
-def test_a_curve_whose_corner_has_no_vertex_of_its_own_is_followed_all_the_same():
-    """Two corners nearer to each other than to any other vertex of the grid: both curves are held, one from the vertex
-    beside."""
+def test_a_curve_is_traced_even_if_another_corner_takes_its_vertex():
+    """Two corners share their nearest vertex of the grid: both curves get a path, one from the vertex beside it."""
     side = 21
     x, y = np.meshgrid(np.arange(side), np.arange(side), indexing="ij")
     vertices = np.stack([x, y, 0 * x], -1).reshape(-1, 3).astype(float)

@@ -1,4 +1,4 @@
-"""Features across quads: their diagonal, the cut along it."""
+"""Features across quads: vertices held to diagonals, and quads cut along them."""
 
 import numpy as np
 
@@ -9,14 +9,14 @@ from gdtool.remesh.fit.surface_projection import ProjectionTarget, subdivide
 
 
 def grid(n: int = 4):
-    """A flat grid of n x n unit quads."""
+    """Make a flat grid of n x n unit quads."""
     y, x = np.mgrid[: n + 1, : n + 1]
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(float)
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     return vertices, np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], -1)
 
 
-def test_a_path_round_a_corner_crosses_its_quad():
+def test_a_path_around_a_corner_crosses_its_quad():
     vertices, faces = grid()
     walk = [5, 6, 11, 12]  # right, up, right: a staircase about the quads of corners 6 and 5
     path = np.stack([walk[:-1], walk[1:]], -1)

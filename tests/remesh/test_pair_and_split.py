@@ -1,4 +1,4 @@
-"""The fallback without an engine: triangles paired and split."""
+"""The fallback without an engine: triangles are paired and split into quads."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
 from tests.remesh.engines import whole
 
 
-def test_pairing_gives_the_asked_count_exactly():
+def test_pairing_gives_the_requested_count_exactly():
     vertices, faces = sphere(24)
     for count in (3 * len(faces) - 500, int(2.2 * len(faces))):
         made = pair_and_split(TriMesh(vertices, faces), count)
@@ -30,7 +30,7 @@ def test_pairing_gives_the_asked_count_exactly():
 
 
 def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypatch):
-    """One whose gentler steps keep the small piece: a third more quads than asked for, and not the whole mesh's."""
+    """The gentler steps keep the small piece: a third more quads than requested, but fewer than of the whole mesh."""
     small, large = sphere(8), sphere(24)
     vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
     tried = []
@@ -52,8 +52,8 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     assert asked < len(quads_out) < 1.5 * asked < 1.8 * len(faces)
 
 
-def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_number(monkeypatch):
-    """A cube has twelve triangles whatever their edge; on a sphere any number is found."""
+def test_isotropic_remeshing_stops_when_the_count_improves_no_more(monkeypatch):
+    """A cube has twelve triangles whatever their edge length; on a sphere any number can be reached."""
     import pymeshlab
 
     runs, mesh_set = [], pymeshlab.MeshSet
@@ -77,8 +77,8 @@ def test_even_triangles_are_sought_no_longer_than_they_come_nearer_to_their_numb
         (joined(*[sphere(8)] * 9), 240, True),
     ],
 )
-def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, quads, few):
-    """Twelve for a piece, and eighty for a handle."""
+def test_isotropic_remeshing_is_skipped_for_too_few_triangles(monkeypatch, mesh, quads, few):
+    """At least twelve triangles are needed for a piece, and eighty for a handle."""
     sought = []
     monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *given: sought.append(given))
     monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
@@ -90,8 +90,8 @@ def test_even_triangles_that_would_be_too_few_are_not_sought(monkeypatch, mesh, 
     assert topology.is_watertight(faces)
 
 
-def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
-    """Pins with few triangles around: what bends too much stays single, and there are fewer triangles for it."""
+def test_the_fallback_corrects_its_count_for_unpaired_triangles():
+    """Pins of few triangles: those that bend too much stay single, so fewer triangles are used."""
     vertices, faces = joined(*((pin[0] + (0.3 * k, 0, 0), pin[1]) for k, pin in enumerate([rod(24)] * 8)))
     made = fallback.quads_from_input(TriMesh(vertices, faces), 400, 60.0)
     quads_out = made.faces
@@ -102,7 +102,7 @@ def test_the_fallback_makes_up_for_pairs_that_it_does_not_find():
 
 @pytest.mark.parametrize("shape", ["slivers", "coincident"])
 def test_splitting_makes_square_quads_of_any_triangles(shape):
-    """What no engine manages is made even first: long slivers, and sheets that touch without being joined."""
+    """Triangles on which engines fail: long slivers, and sheets that touch without being joined."""
     if shape == "slivers":
         vertices, faces = cube()
         vertices = vertices * (1, 0.4, 0.15)  # twelve triangles
@@ -126,8 +126,8 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
     )
 
 
-def test_quads_without_area_are_evened_out_where_their_neighbours_stay(monkeypatch):
-    """A mesh of the fallback whose every vertex is to stay, but one quad was split without area."""
+def test_quads_without_area_are_smoothed_while_their_neighbours_stay(monkeypatch):
+    """All vertices are to keep their original positions, except those of a quad without area."""
     vertices, faces = sphere(24, 0.5)
     made = pair_and_split(TriMesh(vertices, faces), 600)
     split, quad_faces = made.vertices, made.faces

@@ -15,9 +15,8 @@ from tests.remesh.engines import in_this_process, whole
 
 
 @pytest.mark.slow
-def test_large_parts_are_not_torn_down_for_small_ones():
-    """An assembly with more pins than the count has quads to spare, all of slivers, which the quick collapse does not
-    touch."""
+def test_large_pieces_are_not_decimated_further_because_of_small_ones():
+    """An assembly with many pins of slivers, which the quick collapse does not reduce."""
     vertices, faces = assembly(60, 128)
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000))
     out, quads_out = made.vertices, made.faces
@@ -31,7 +30,7 @@ def test_large_parts_are_not_torn_down_for_small_ones():
     )
 
 
-def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
+def test_a_bad_quick_collapse_is_repeated_with_the_topology_kept(monkeypatch):
     vertices, faces = sphere(120, 0.5)
     begun, begin = [], simplify.begin
 
@@ -49,7 +48,7 @@ def test_what_the_quick_collapse_ruins_is_made_again_with_care(monkeypatch):
     assert record.figures["simplify_error"] < 0.01
 
 
-def test_sphere():
+def test_sphere_keeps_its_radius():
     vertices, faces = sphere(48)
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000))
     out, quads_out = made.vertices, made.faces
@@ -71,9 +70,8 @@ def test_torus_keeps_its_hole():
 
 
 @pytest.mark.parametrize("each, ways", [(70, {"engines"}), (220, {"instant-meshes, 1 subdivision"})])
-def test_a_net_of_so_many_handles_that_engines_lose_some_keeps_all(each, ways):
-    """With few quads for each handle what would fail is not tried: no engine, or only none that starts from fewer
-    still."""
+def test_a_lattice_keeps_all_handles_where_engines_would_lose_some(each, ways):
+    """With few quads for each handle, attempts that would lose handles are skipped: all, or those that subdivide."""
     vertices, faces = lattice()
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=28 * each))
     out, quads_out = made.vertices, made.faces
@@ -86,7 +84,7 @@ def test_a_net_of_so_many_handles_that_engines_lose_some_keeps_all(each, ways):
     assert shape_figures(QuadMesh(out, quads_out))["folded_share"] < 1e-3
 
 
-def test_an_engine_that_is_asked_for_is_tried_whatever_the_handles(monkeypatch):
+def test_a_requested_engine_is_tried_whatever_the_handles(monkeypatch):
     tried = in_this_process(monkeypatch, lambda *given: ENGINES["instant-meshes"](*given))
     pipeline.remesh(TriMesh(*lattice()), Request(quads=1000, engine="instant-meshes"))
     assert tried

@@ -1,4 +1,4 @@
-"""What an engine makes is mended, judged and not believed; whatever it does, a way through is found."""
+"""Engines' quads are repaired and judged; whatever an engine does, there is a result."""
 
 import time
 
@@ -36,8 +36,8 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
 
 
 @pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
-def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
-    """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
+def test_an_engine_far_from_the_surface_runs_once_and_a_crashing_one_again(monkeypatch, outcome, runs):
+    """Another density, or no creases, may avoid a crash; quads too coarse for a part stay so."""
     vertices, faces = sphere(24)
     made, _ = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -75,8 +75,8 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]), ((0.3, 0.3), 875, [0, 1])],
     ids=["far", "of another count", "in no doubt", "both far"],
 )
-def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
-    """Balls without a cap, and whole ones."""
+def test_a_much_nearer_candidate_goes_before_a_doubtful_one(tops, wanted, order):
+    """Candidates are balls without a cap, and whole balls."""
     vertices, faces = sphere(24, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -93,9 +93,9 @@ def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_i
     ]
 
 
-def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
-    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
-    over."""
+def test_quads_that_leave_out_surface_are_rejected_before_fitting(monkeypatch):
+    """Half a ball is rejected, not asked for another count; a whole ball passes, and one whose missing cap tips can
+    cover."""
     vertices, faces = sphere(24, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -122,7 +122,7 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
 
 
 @pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
-def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
+def test_subdivision_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
     vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
     patch = RemeshPatch(TriMesh(vertices, faces), 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
@@ -152,7 +152,7 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
 
 
 def with_tunnel(vertices, faces, length):
-    """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
+    """Connect two triangles of a ball by a tunnel: the topmost one, and one about `length` away from it."""
     centre = vertices[faces].mean(1)
     top = centre[:, 2].argmax()
     other = np.abs(np.linalg.norm(centre - centre[top], axis=1) - length).argmin()
@@ -167,7 +167,7 @@ def bored_ball():
 
 
 @pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
-def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
+def test_only_handles_finer_than_a_quad_may_be_lost(monkeypatch, shape, given_up):
     vertices, faces = sphere(96, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -183,7 +183,7 @@ def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, sh
     assert topology.euler_number(quads_out) == (2 if given_up else 0)
 
 
-def test_torn_output_is_not_believed(monkeypatch):
+def test_torn_output_is_rejected(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
     in_this_process(monkeypatch, lambda *_: QuadMesh(np.random.default_rng(0).random((8, 3)), book))
@@ -195,7 +195,7 @@ def test_torn_output_is_not_believed(monkeypatch):
     assert any("pieces are lost" in text for text in record.failed)
 
 
-def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
+def test_a_hole_with_a_quad_attached_by_one_corner_is_closed():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     corners, sides = around(faces, middle)
@@ -211,8 +211,8 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
-def test_candidates_are_in_the_order_of_place(monkeypatch):
-    """Whatever order an engine leaves its quads in."""
+def test_candidates_are_sorted_in_space(monkeypatch):
+    """Candidates are sorted in space, whatever the order of the engine's quads."""
     vertices, faces = quad_cube(3)
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
@@ -235,7 +235,7 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
 
-def test_output_without_area_is_no_quads():
+def test_output_without_area_is_rejected_as_no_quads():
     vertices, faces = quad_cube(1)
     assert (
         candidates.repair_and_judge(QuadMesh(vertices, faces[:, [0, 1, 1, 0]]), topology.invariants(faces)).fault
@@ -243,7 +243,7 @@ def test_output_without_area_is_no_quads():
     )
 
 
-def test_quads_that_cut_edges_off_do_not_do():
+def test_quads_that_cut_off_edges_are_rejected():
     vertices, faces = quad_cube(3)
     surface, edge = ProjectionTarget(TriMesh(vertices, triangulated(faces)[0])), 0.125 * np.ptp(vertices[:, 0])
     assert rejection_reason(QuadMesh(vertices, faces), surface, edge, 1.0, 0.005)[0] is None
@@ -254,7 +254,7 @@ def test_quads_that_cut_edges_off_do_not_do():
     assert rejection_reason(QuadMesh(cut, faces), surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
-def test_surface_that_the_quads_do_without_is_measured():
+def test_uncovered_surface_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
     rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
@@ -267,9 +267,11 @@ def test_surface_that_the_quads_do_without_is_measured():
     )
 
 
-def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
-    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it
-    does not, it is better than none."""
+def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(monkeypatch):
+    """The limits of subdivided results are stricter, since attempts without subdivision follow.
+
+    If all of these fail, a subdivided result within the wider limits is taken.
+    """
 
     engine = candidates.ENGINES["instant-meshes"]
 
@@ -303,8 +305,8 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
     assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
 
 
-def test_when_the_time_is_over_no_engine_is_begun():
-    """What was asked for comes all the same, as paired triangles, and the record says why."""
+def test_no_engine_is_started_when_the_time_is_over():
+    """The quads are still made, of paired triangles, and the record has the reason."""
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, seconds=0.0))
@@ -316,7 +318,7 @@ def test_when_the_time_is_over_no_engine_is_begun():
     assert time.monotonic() - start < 30
 
 
-def test_every_round_asks_for_two_densities():
+def test_every_round_requests_two_counts():
     attempt = search._attempts(20000, Request())[0]
     assert len(attempt.counts_around(20000)) == 2
     assert np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
@@ -325,9 +327,11 @@ def test_every_round_asks_for_two_densities():
     )
 
 
-def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
-    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
-    again."""
+def test_the_next_request_lies_between_too_few_and_too_many():
+    """An engine's count can jump by 5 %.
+
+    A request in proportion to the last answer would repeat a request that gave too many.
+    """
     answers = [search.EngineAnswer(19700.0, 20868), search.EngineAnswer(20100.0, 21164)]
     assert search._interpolate_request(answers, 20000) is None
     assert search._interpolate_request(answers, 22000) is None
@@ -335,9 +339,11 @@ def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_man
     assert search._interpolate_request(answers, 20000) == pytest.approx(19186, abs=1)
 
 
-def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
-    """The first in rank where it will do, without a look at the other, and the other first where the first's outline
-    leaves out more; where none does, what comes nearest to it."""
+def test_the_first_good_candidate_is_taken(monkeypatch):
+    """The first in rank is taken without fitting the other, if it is good.
+
+    The other goes first if the first is not promising. If none is good, the nearest to the surface is taken.
+    """
     attempt = search._attempts(20000, Request())[0]
     drawn = []
 
@@ -379,9 +385,11 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
     assert len(drawn) == 2
 
 
-def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
-    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
-    and only then a new one asked for."""
+def test_the_count_includes_tips_before_fitting(monkeypatch):
+    """A candidate with too many quads, tips included, is not fitted.
+
+    The next candidate with fewer quads is fitted before a new request is made.
+    """
     attempt = search._attempts(20000, Request())[0]
     search_run = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 4000, 0.1, Request(), None), Record())
 
@@ -408,9 +416,8 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     assert list(search_run._with_right_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
 
 
-def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
-    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record
-    says so."""
+def test_subdivision_is_not_tried_where_creases_are_closer_than_a_quad(monkeypatch):
+    """A plate hardly thicker than a quad: only full density is requested, and both rims are met."""
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
@@ -428,8 +435,8 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
 
 
 @pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
-def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch, given, least, most):
-    """It follows the quads and triangles: Instant Meshes fills some holes for ever."""
+def test_an_engine_has_its_own_memory_limit_within_the_requests(monkeypatch, given, least, most):
+    """The limit follows the number of quads and triangles, because Instant Meshes fills some holes for ever."""
     limits = []
 
     def begin(*_, memory_mb, **more):

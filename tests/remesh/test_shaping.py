@@ -1,4 +1,4 @@
-"""Quads drawn onto a surface: what is known of their vertices is known of them still when some are gone."""
+"""Fitting quads: constraints and tips stay those of their vertices after quads were collapsed."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube
 
 
-def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
+def test_tips_are_found_again_after_folded_quads_were_collapsed(monkeypatch):
     vertices, quads = quad_cube(2)
     fixed, tips, gone = np.array([3, 11, 20, 40]), np.array([11, 40]), 7
     constraints = Constraints.none(len(vertices))
@@ -18,7 +18,7 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
     eased = []
 
     def without_one(mesh, surface, constraints):
-        """A vertex becomes another, a quad is gone."""
+        """Merge a vertex into another, and remove a quad."""
         number = np.arange(len(vertices)) - (np.arange(len(vertices)) > gone)
         kept = np.delete(np.arange(len(vertices)), gone)
         return (

@@ -1,4 +1,4 @@
-"""Squaring quads: folds undone on the surface, straight corners let off their curves."""
+"""Squaring quads: folds are undone on the surface, and straight corners are released from their curves."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def grid(n=8):
     return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1), np.stack([i, i + 1, i + n + 2, i + n + 1], -1)
 
 
-def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
+def test_folded_quads_are_unfolded_on_the_surface():
     vertices, quads = grid()
     bent = vertices.copy()
     bent[40] += [0.19, 0.17, 0]  # past its neighbour
@@ -36,7 +36,7 @@ def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
     assert np.array_equal(out[rim], vertices[rim])
 
 
-def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
+def test_the_middle_of_three_corners_in_a_line_is_released_from_its_curve():
     vertices, quads = grid()
     path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then round a quad's corner at 40
     curve = np.full(len(vertices), -1)
@@ -60,7 +60,7 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     )
 
 
-def test_a_corner_pinned_in_the_wrong_place_is_eased():
+def test_a_corner_pinned_in_the_wrong_place_is_released():
     vertices, quads = grid()
     bent = vertices.copy()
     bent[40] = bent[50] + [0.01, 0.01, 0]
@@ -74,7 +74,7 @@ def test_a_corner_pinned_in_the_wrong_place_is_eased():
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
 @pytest.mark.parametrize("height", [0.15, 0.25])
-def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height, moved, by):
+def test_a_tip_beside_folded_quads_stays_where_smoothing_would_shrink_it(height, moved, by):
     vertices, quads = grid()
     tip = 40
     vertices[tip, 2] = height
@@ -100,7 +100,7 @@ def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height,
     assert not left.fixed[tip]
 
 
-def test_easing_folds_nothing_that_was_not_folded():
+def test_releasing_folds_no_further_quads():
     vertices, quads = grid()
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Shaping: figures, subdivision, doublets, holes."""
+"""Projection to the surface: figures of quads, subdivision, doublets, holes."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def test_doublet_is_removed():
     assert len(out) == 2
 
 
-def test_two_holes_that_meet_at_a_vertex_are_closed_each_by_itself():
+def test_two_holes_that_meet_at_a_vertex_are_closed_separately():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     open_faces = np.delete(faces, [middle, around(faces, middle)[0][0]], 0)

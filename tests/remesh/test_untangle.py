@@ -1,4 +1,4 @@
-"""Folded quads: mended where they are, on the surface and on their curves, and nothing else moves."""
+"""Folded quads are untangled on the surface and on their curves, and nothing else moves."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.geometry.solids import cube, plane, quad_cube
 
 
 def grid(n):
-    """Square of side 1 in z = 0 of n * n quads."""
+    """Make a square of side 1 in z = 0 of n x n quads."""
     line = np.linspace(-0.5, 0.5, n + 1)
     x, y = np.meshgrid(line, line)
     i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
@@ -20,14 +20,14 @@ def grid(n):
 
 
 def folded(n, step=0.25):
-    """A grid with some inner vertices, none beside another, pulled past their neighbours."""
+    """Make a grid with some inner vertices, no two adjacent, pulled past their neighbours; also return these."""
     vertices, faces = grid(n)
     pulled = [y * (n + 1) + x for y in range(2, n - 1, 3) for x in range(2, n - 1, 3)]
     vertices[pulled, 0] += step
     return vertices, faces, np.array(pulled)
 
 
-def test_many_folds_are_mended_at_once_and_the_rest_stays():
+def test_many_folds_are_untangled_at_once_and_other_vertices_stay():
     vertices, faces, pulled = folded(12)
     assert (scaled_jacobian(QuadMesh(vertices, faces)) <= 0).sum() >= len(pulled)
     out = untangle(
@@ -45,7 +45,7 @@ def test_many_folds_are_mended_at_once_and_the_rest_stays():
     assert np.array_equal(out[still], vertices[still])
 
 
-def test_what_is_fixed_leaves_its_place_in_the_last_rounds_only():
+def test_fixed_vertices_move_in_the_last_rounds_only():
     vertices, faces, pulled = folded(6)
     fixed = np.zeros(len(vertices), bool)
     fixed[pulled] = True
@@ -83,7 +83,7 @@ def test_vertices_on_a_crease_slide_along_it():
 
 
 @pytest.mark.parametrize("mesh", [grid(7), quad_cube(2)])
-def test_batches_share_no_face_and_hold_all(mesh):
+def test_vertices_of_a_batch_share_no_face(mesh):
     vertices, faces = mesh
     batches = _independent_batches(np.arange(len(vertices)), faces, faces_around_vertices(faces, len(vertices)))
     assert sorted(np.concatenate(batches)) == list(range(len(vertices)))
@@ -92,7 +92,7 @@ def test_batches_share_no_face_and_hold_all(mesh):
 
 
 def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
-    """Whatever number of faces and neighbours the others have: folds beside the rim, in corners and within."""
+    """A batch mixes vertices with different numbers of faces and neighbours: beside the rim, in corners and within."""
     vertices, faces, _ = folded(9)
     vertices[[12, 38, 56], 1] += 0.2
     how = (

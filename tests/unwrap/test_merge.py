@@ -1,4 +1,4 @@
-"""Small charts and the neighbours that they lie flat with."""
+"""Small charts merge with the neighbours that they lie flat with."""
 
 import numpy as np
 import trimesh
@@ -13,7 +13,7 @@ GOOD = 1.002
 
 
 def sheet(n, height=0.0, bend=0.0, down=False):
-    """n x n quads over the unit square, bent about y with so much curvature."""
+    """Make n x n quads over the unit square, bent about y with curvature `bend`."""
     u, v = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
     turn = bend * (u - 0.5)
     x, z = (np.sin(turn) / bend, (1 - np.cos(turn)) / bend) if bend else (u, 0 * u)
@@ -39,7 +39,7 @@ def test_large_charts_stay_apart():
     assert (merge_small_charts(QuadMesh(vertices, faces), label, proxy_of(vertices, faces), GOOD) == label).all()
 
 
-def test_what_would_close_or_stretch_stays_apart():
+def test_charts_that_would_close_or_stretch_stay_apart():
     ball = trimesh.creation.icosphere(4)
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     height = ball.triangles_center[:, 2]
@@ -66,8 +66,8 @@ def test_the_sides_of_a_thin_wall_keep_their_labels():
     assert (labels == np.repeat([0, 1], 98)).all()
 
 
-def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch):
-    """A hemisphere and its cap, taken for one chart: together they stretch, apart each does what it can."""
+def test_charts_that_are_flat_together_only_on_the_proxy_are_split_again(monkeypatch):
+    """A hemisphere and its cap, merged into one chart: together they stretch too much, so each becomes a chart."""
     ball = trimesh.creation.icosphere(4)
     ball.update_faces(ball.triangles_center[:, 2] > 0)
     ball.remove_unreferenced_vertices()
@@ -86,7 +86,7 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     assert ((owner == owner[label.argmax()]) == (label == 1)).all()
 
 
-def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():
+def test_a_vertex_in_which_a_chart_touches_itself_is_doubled():
     from gdtool.unwrap.segment.charts import chart_mesh
 
     vertices, faces = sheet(2)

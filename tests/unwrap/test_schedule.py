@@ -16,6 +16,7 @@ def ball(level=4):
 
 
 def whole_stretch(vertices, faces, charts):
+    """Compute the L2 stretch of all charts together."""
     points, corners, uvs, offset = [], [], [], 0
     for faces_idx, own, uv, triangles in charts:
         place = np.zeros((len(uv), 3))
@@ -27,7 +28,7 @@ def whole_stretch(vertices, faces, charts):
     return stretch(TriMesh(np.concatenate(points), np.concatenate(corners).astype(np.int64)), np.concatenate(uvs))
 
 
-def test_charts_that_stretch_most_are_cut_until_the_whole_stretches_little(monkeypatch):
+def test_the_most_stretched_charts_are_cut_until_all_together_stretch_little(monkeypatch):
     vertices, faces, centre = ball()
     label = (centre[:, 2] > 0).astype(int)
     proxy = TriMesh(vertices, faces[:, :3])
@@ -53,8 +54,8 @@ def test_charts_that_stretch_little_stay_whole():
     assert not any("more than most" in line for line in result.failed)
 
 
-def test_what_cannot_be_relieved_ends(monkeypatch):
-    """Faces without area, and folds in which every cut stretches again: the number of cuts is bounded."""
+def test_cutting_ends_where_stretch_cannot_be_reduced(monkeypatch):
+    """Faces without area, and folds that stretch again after every cut: the number of cuts is bounded."""
     vertices, faces, centre = ball(3)
     crumpled = vertices * (1 + 0.5 * np.random.default_rng(0).random((len(vertices), 1)))
     label = (centre[:, 2] > 0).astype(int)
@@ -68,7 +69,7 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
 
 
-def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
+def test_a_chart_is_cut_between_its_parts_or_else_through_the_middle():
     from gdtool.unwrap.segment.charts import Adjacency
     from tests.unwrap.test_merge import sheet
 

@@ -1,4 +1,4 @@
-"""Where flat charts are cut for packing: first where their rectangles lose most, and past crumbs along a rough rim."""
+"""Flat charts are cut for packing: first where rectangles save most area, and past small parts along a rough rim."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
 
 def plates(*cells):
-    """Vertices, quads and a flat chart for each of some masks (h, w) of unit cells, one above the other."""
+    """Make plates of unit cells, one above the other, from masks (h, w); return their adjacency and flat charts."""
     points, quads, charts, vertices, faces = [], [], [], 0, 0
     for height, mask in enumerate(cells):
         h, w = mask.shape
@@ -29,6 +29,7 @@ def plates(*cells):
 
 
 def ell(size, arm):
+    """Make the mask of an L in a square of `size` cells, with arms `arm` cells wide."""
     mask = np.zeros((size, size), bool)
     mask[:arm], mask[:, :arm] = True, True
     return mask
@@ -45,7 +46,7 @@ def test_the_chart_whose_rectangle_is_emptiest_is_cut_first():
     assert all(np.prod(np.ptp(chart[2], 0)) < 1.2 * len(chart[0]) for chart in parts)
 
 
-def test_crumbs_along_a_rough_rim_do_not_forbid_a_cut():
+def test_small_parts_along_a_rough_rim_do_not_prevent_a_cut():
     """An L whose inner rims are combs: a line along them cuts off each tooth."""
     mask = ell(40, 8)
     mask[8, 9::2], mask[9::2, 8] = True, True
