@@ -29,7 +29,6 @@ from benchmarks.common.fine_meshes import models_in
 from benchmarks.common.measure import ROOT, busy, machine, number, peak_mb, say, table
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.common.wireframe import file_name
-from gdtool.geometry.meshes import TriMesh
 
 PEER = Path(__file__).with_name("in_blender.py")
 COLUMNS = (
@@ -103,7 +102,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     origin = from_scene(scene, np.eye(4), lambda detail: 0.5 * width / samples_for(width, detail) ** 0.5)
     cost, clock = {}, Clock()
     texels = texels_of(target, size, threads=threads)
-    reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
+    reach = vertex_reach(target.mesh, origin.source)
     baked = bake(
         target, texels, origin.source, origin.lookup, reach, BakeOptions(samples_for(width, origin.detail), threads)
     )

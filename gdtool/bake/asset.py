@@ -12,7 +12,7 @@ from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import CornerNormals, SurfaceModes, Target
 from gdtool.geometry.frames import transform_points
-from gdtool.geometry.meshes import QuadMesh
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.tangents import number_distinct_rows
 
 
@@ -56,13 +56,13 @@ def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
         tangents[..., :3] = tangents[..., :3] @ turn.T
         return replace(
             target,
-            vertices=transform_points(matrix, target.vertices),
+            mesh=TriMesh(transform_points(matrix, target.mesh.vertices), target.mesh.faces),
             normals=target.normals @ turn.T,
             tangents=tangents,
         )
 
     target = moved(meshes.target)
-    mesh = replace(meshes.mesh, vertices=target.vertices)
+    mesh = replace(meshes.mesh, vertices=target.mesh.vertices)
     return AssetMeshes(target, mesh, meshes.face_idx, tuple(moved(level) for level in meshes.levels))
 
 
@@ -99,8 +99,8 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     Corners with equal position, texture coordinates and normal (and tangent, where there is a normal map) share a
     vertex. Tangents are written only where there is a normal map.
     """
-    corner = np.arange(len(target.faces) * 3)
-    position_idx, uv_idx = target.faces.ravel(), target.face_uvs.ravel()
+    corner = np.arange(len(target.mesh.faces) * 3)
+    position_idx, uv_idx = target.mesh.faces.ravel(), target.face_uvs.ravel()
     normals, tangents = target.normals.reshape(-1, 3), target.tangents.reshape(-1, 4)
     columns = [position_idx[:, None], uv_idx[:, None], normals]
     if maps.normal is not None:
@@ -112,14 +112,14 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     order = np.argsort(first, kind="stable")
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    kept = first[order]
+    corner_of_vertex = first[order]
     return Scene(
-        vertices=target.vertices[position_idx[kept]],
+        vertices=target.mesh.vertices[position_idx[corner_of_vertex]],
         faces=place[vertex].reshape(-1, 3).astype(np.int32),
         materials=(material,),
-        normals=normals[kept],
-        tangents=tangents[kept] if maps.normal is not None else None,
-        uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],),
+        normals=normals[corner_of_vertex],
+        tangents=tangents[corner_of_vertex] if maps.normal is not None else None,
+        uvs=(np.asarray(target.uv, np.float64)[uv_idx[corner_of_vertex]],),
         name=name,
     )
 

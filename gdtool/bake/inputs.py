@@ -159,8 +159,9 @@ def read_origin(
     turned round, because most of them faced away from the target's.
     """
     origin = _origin(source, choice, target, matrix)
-    few = slice(None, None, max(1, len(target.faces) // MOST_COMPARED))
-    turned = origin.source.turn_to(target.vertices[target.faces[few]].mean(1), target.normals[few].mean(1))
+    vertices, faces = target.mesh.vertices, target.mesh.faces
+    few = slice(None, None, max(1, len(faces) // MOST_COMPARED))
+    turned = origin.source.turn_to(vertices[faces[few]].mean(1), target.normals[few].mean(1))
     return origin, turned
 
 
@@ -192,7 +193,7 @@ def _surface_origin(choice: SourceChoice) -> Origin:
         views = read_views(choice.views, (*MATERIALS, "normal"))
         for domain in (*MATERIALS, "normal"):
             if domain not in views.images:
-                choice.skipped.append((f"{domain} views", "the views do not hold it: the surface's vertices serve"))
+                choice.skipped.append((f"{domain} views", "the views do not have it: the surface's vertices are used"))
     use_field = surface.content.field and not (views and set(MATERIALS) <= set(views.images))
     network = material_field(surface.file("field.safetensors"), choice.device) if use_field else None
     views = views if views is not None and views.images else None
@@ -207,7 +208,7 @@ def _read_picture(choice: SourceChoice, views: Views) -> Picture | None:
     if image_and_camera is None or "albedo" not in views.images:
         missing = image_and_camera is None
         choice.skipped.append(
-            ("picture", "the views' folder holds none" if missing else "the views hold no albedo for its detail")
+            ("picture", "the views' folder holds none" if missing else "the views have no albedo to add its detail to")
         )
         return None
     image, camera = image_and_camera

@@ -44,26 +44,26 @@ def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
 
     Levels that cannot be made, are hardly coarser, or drift too far on the maps are left out.
     """
-    counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
-    out, previous = Levels(), len(target.faces)
+    counts = [max(len(target.mesh.faces) >> k, 4) for k in range(1, count)]
+    out, previous = Levels(), len(target.mesh.faces)
     # Each level is made by a child process: threads only wait for them.
     for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, threads), strict=True):
-        if level is not None and len(level.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
-            level, why = None, f"it cannot have fewer than {len(level.faces)} triangles without tearing a seam"
+        if level is not None and len(level.mesh.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
+            level, why = None, f"it cannot have fewer than {len(level.mesh.faces)} triangles without tearing a seam"
         if level is None:
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
         drifted = drift(level, target)
         if drifted["drift_mean"] > MAX_DRIFT:
-            why = f"it would slide {100 * drifted['drift_mean']:.1f} % of the extent on the maps"
+            why = f"its surface would drift on the maps by {100 * drifted['drift_mean']:.1f} % of the extent"
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
-        previous = len(level.faces)
+        previous = len(level.mesh.faces)
         if previous > MAX_EXCESS * wanted:
             out.warnings.append(f"the level of {wanted} triangles has {previous}: fewer would tear a seam")
         out.targets.append(level)
         name = f"lod{len(out.targets)}"
-        out.report[f"{name}_triangles"] = len(level.faces)
+        out.report[f"{name}_triangles"] = len(level.mesh.faces)
         out.report |= {f"{name}_{figure}": value for figure, value in drifted.items()}
     return out
 
@@ -116,7 +116,7 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
         with temporary_folder() as folder:
             mesh, uv = call(
                 collapse_textured,
-                TriMesh(target.vertices, target.faces.astype(np.int64)),
+                TriMesh(target.mesh.vertices, target.mesh.faces.astype(np.int64)),
                 target.uv[target.face_uvs],
                 target_faces,
                 str(folder),
@@ -141,9 +141,7 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
 
-    points, face_idx, barycentric = sample_surface(
-        TriMesh(level.vertices, level.faces), count, np.random.default_rng(0)
-    )
+    points, face_idx, barycentric = sample_surface(level.mesh, count, np.random.default_rng(0))
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)
@@ -153,9 +151,9 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     column, row = np.clip((uv * size).astype(np.int64), 0, size - 1).T
     face = owner[row * size + column]
     known = face >= 0
-    at = inside.at(face[known], uv[known, 0], uv[known, 1])
-    there = np.einsum("nk,nkc->nc", np.clip(at, -1, 2), full.vertices[full.faces[face[known]]])
-    apart = np.linalg.norm(there - points[known], axis=1) / float(np.ptp(full.vertices, axis=0).max())
+    weights = inside.at(face[known], uv[known, 0], uv[known, 1])
+    full_points = np.einsum("nk,nkc->nc", np.clip(weights, -1, 2), full.mesh.vertices[full.mesh.faces[face[known]]])
+    apart = np.linalg.norm(full_points - points[known], axis=1) / full.mesh.extent
     return {
         "drift_mean": float(apart.mean()),
         "drift_p99": float(np.percentile(apart, 99)),

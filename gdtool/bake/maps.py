@@ -218,7 +218,7 @@ def _add_base_color(
         layers.channels["base_color"] = color if alpha is None else [*color, alpha]
     else:
         layers.factors["base_color"] = (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)
-        layers.skipped.append(("base_color map", "base color is constant: a factor says it"))
+        layers.skipped.append(("base_color map", "base color is constant: a factor stores it"))
     return alpha
 
 
@@ -240,7 +240,7 @@ def _add_orm(
             layers.factors[name] = (round(float(constant), 6),)
     varies = any(channel is not None for channel in packed)
     if not varies:
-        layers.skipped.append(("roughness and metallic map", "both are constant: factors say them"))
+        layers.skipped.append(("roughness and metallic map", "both are constant: factors store them"))
     open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
     if open_everywhere:
         layers.skipped.append(("occlusion map", "nothing is occluded"))
@@ -274,7 +274,7 @@ def _add_emissive(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]
         layers.factors["emissive"], layers.channels["emissive"] = (round(top, 6),) * 3, scaled
     else:
         layers.factors["emissive"] = tuple(round(float(x) * top, 6) for x in linear_from_srgb(np.array(constants)))
-        layers.skipped.append(("emissive map", "emission is constant: a factor says it"))
+        layers.skipped.append(("emissive map", "emission is constant: a factor stores it"))
 
 
 def _add_extra(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]) -> None:

@@ -64,7 +64,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
     known = np.concatenate([at / spacing, unit(facing), trace(coarse.face_idx, coarse.barycentric)[:, None]], 1)
     known[:, 6] = _smoothed(known, slot.reshape(coarse.size, coarse.size))
     out = np.zeros(len(texels), np.float32)
-    helped = np.zeros(len(texels), bool)
+    has_similar = np.zeros(len(texels), bool)
 
     def run(part: slice) -> None:
         at, facing, _, _ = surface_at(target, texels.face_idx[part], texels.barycentric[part])
@@ -82,15 +82,15 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
             weight = np.where(k >= 0, share * _similarity(near, fine), np.float32(0))
             total += weight
             value += weight * near[:, 6]
-        helped[part] = total > 1e-5
+        has_similar[part] = total > 1e-5
         out[part] = value / np.maximum(total, np.float32(1e-12))
 
     parts = [slice(s, min(s + TEXELS_AT_ONCE, texels.inside)) for s in range(0, texels.inside, TEXELS_AT_ONCE)]
     for _ in mapped(run, parts, threads):
         pass
-    alone = np.flatnonzero(~helped[: texels.inside])
-    if len(alone):
-        out[alone] = trace(texels.face_idx[alone], texels.barycentric[alone])
+    unmatched = np.flatnonzero(~has_similar[: texels.inside])
+    if len(unmatched):
+        out[unmatched] = trace(texels.face_idx[unmatched], texels.barycentric[unmatched])
     # Beyond a crease the surface faces elsewhere: the rings around charts continue their inside instead.
     continue_into_rings(texels, out)
     return out
@@ -108,11 +108,11 @@ def continue_into_rings(texels: Texels, values: np.ndarray) -> None:
     waiting = np.arange(texels.inside, texels.inside + len(ring))
     while len(waiting):
         near = slot[place[waiting][:, None] + [o + d for o in (-size - 2, 0, size + 2) for d in (-1, 0, 1)]]
-        there = near >= 0
-        reached = there.any(1)
+        is_known = near >= 0
+        reached = is_known.any(1)
         if not reached.any():
             break
-        mean = np.where(there, values[near], 0).sum(1) / np.maximum(there.sum(1), 1)
+        mean = np.where(is_known, values[near], 0).sum(1) / np.maximum(is_known.sum(1), 1)
         done = waiting[reached]
         values[done] = mean[reached]
         slot[place[done]] = done
@@ -143,9 +143,9 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
     padded = np.pad(slot, 2, constant_values=-1)
     out = known[:, 6].copy()
     for start in range(0, len(texel), TEXELS_AT_ONCE):
-        here = texel[start : start + TEXELS_AT_ONCE]
-        r, c, mine = row[start : start + TEXELS_AT_ONCE], column[start : start + TEXELS_AT_ONCE], known[here]
-        total, value = np.ones(len(here), np.float32), mine[:, 6].copy()
+        centre_idx = texel[start : start + TEXELS_AT_ONCE]
+        r, c, centre = row[start : start + TEXELS_AT_ONCE], column[start : start + TEXELS_AT_ONCE], known[centre_idx]
+        total, value = np.ones(len(centre_idx), np.float32), centre[:, 6].copy()
         for dr in range(-2, 3):
             for dc in range(-2, 3):
                 if not dr and not dc:
@@ -153,10 +153,10 @@ def _smoothed(known: np.ndarray, slot: np.ndarray) -> np.ndarray:
                 k = padded[r + 2 + dr, c + 2 + dc]
                 near = np.take(known, k, axis=0)
                 # Wider than for upsampling: occlusion varies slowly, and more neighbours take out more noise.
-                weight = np.where(k >= 0, _similarity(near, mine, wider=2.0), np.float32(0))
+                weight = np.where(k >= 0, _similarity(near, centre, wider=2.0), np.float32(0))
                 total += weight
                 value += weight * near[:, 6]
-        out[here] = value / total
+        out[centre_idx] = value / total
     return out
 
 

@@ -85,10 +85,9 @@ def from_surface(
     field (see material_field) replaces the vertices for the materials that no view has. picture: the one that the views
     were generated from; it adds finer detail.
     """
-    source = Source(TriMesh(surface.vertices, surface.faces))
-    normals = (
-        surface.normals if surface.normals is not None else vertex_normals(TriMesh(surface.vertices, surface.faces))
-    )
+    mesh = TriMesh(surface.vertices, surface.faces)
+    source = Source(mesh)
+    normals = surface.normals if surface.normals is not None else vertex_normals(mesh)
     attributes = {
         "albedo": surface.albedo,
         "roughness": surface.roughness,
@@ -124,7 +123,7 @@ def _with_field(
     """Make a lookup that takes the named materials from a field, and the others from `lookup`."""
 
     def with_field(places: Places) -> dict[str, np.ndarray]:
-        read = field(source.at(places.face_idx, places.barycentric, source.vertices))
+        read = field(source.at(places.face_idx, places.barycentric, source.mesh.vertices))
         return {**lookup(places), **{name: read[name] for name in names}}
 
     return with_field
@@ -140,7 +139,7 @@ def _views_are_finer(views: Views, source: Source) -> bool:
 
 def _edge(source: Source) -> float:
     """Compute the median edge length of the source's triangles."""
-    corners = source.vertices[source.faces]
+    corners = source.mesh.vertices[source.mesh.faces]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
@@ -204,9 +203,7 @@ def from_scene(
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
     turn, unturned = turn.astype(np.float32), bool(np.allclose(turn, np.eye(3), atol=1e-9))
     source = Source(TriMesh(transform_points(matrix, scene.vertices), scene.faces))
-    normals = (
-        scene.normals @ turn.T if scene.normals is not None else vertex_normals(TriMesh(source.vertices, source.faces))
-    )
+    normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.mesh)
 
     # Single precision is exact to 1/1000 of a texel of a 16384² texture, and takes half the time.
     points = SurfaceLookup(
@@ -229,13 +226,13 @@ def from_scene(
         inward = dot(normal, source.normals_of(places.face_idx)) < 0
         if inward.any():
             normal[inward] *= -1
-        out = {name: read[name] for name in kept}
+        out = {name: read[name] for name in names}
         return {**out, "confidence": np.ones(len(normal), np.float32), "normal": normal}
 
     modes = {material.alpha_mode for material in scene.materials}
     mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")
     shines = any(max(material.emissive) > 0 for material in scene.materials)
-    kept = [
+    names = [
         "albedo",
         "roughness",
         "metallic",

@@ -47,7 +47,7 @@ def picture_of(image: np.ndarray, camera: Camera, albedo: np.ndarray) -> Picture
     weighted = np.concatenate([image[..., :3] * image[..., 3:], image[..., 3:]], -1)
     view = resized(weighted, *small)
     fine, coarse = (np.log(x[..., :3] / np.maximum(x[..., 3:], 1e-3) + DARK) for x in (weighted, resized(view, *large)))
-    shown = (image[..., 3:] > 0.5) & (resized(view[..., 3:], *large) > 0.25)
+    is_covered = (image[..., 3:] > 0.5) & (resized(view[..., 3:], *large) > 0.25)
     gain = np.clip(
         detail_gain(
             np.log(view[..., :3] / np.maximum(view[..., 3:], 1e-3) + DARK), np.log(albedo + DARK), view[..., 3]
@@ -57,4 +57,4 @@ def picture_of(image: np.ndarray, camera: Camera, albedo: np.ndarray) -> Picture
     )
     gain = resized(gain, *large)
     factor = np.exp(np.clip(fine - coarse, -np.log(MAX_FACTOR), np.log(MAX_FACTOR)) * gain[..., None])
-    return Picture(np.where(shown, factor, 1).astype(np.float32), camera, large[0] // small[0])
+    return Picture(np.where(is_covered, factor, 1).astype(np.float32), camera, large[0] // small[0])

@@ -104,7 +104,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
 
     def blended(places: Places) -> dict[str, np.ndarray]:
         out = dict(lookup(places))
-        points = source.at(places.face_idx, places.barycentric, source.vertices)
+        points = source.at(places.face_idx, places.barycentric, source.mesh.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
         value, seen, shares = observe(points, out["normal"], images, prior)
@@ -189,7 +189,7 @@ def bake(
         out["tangent_normal"] = encode_tangent_space(*frame[1:], out.pop("normal"))
         if options.height:
             out["height"] = dot(
-                source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1])
+                source.at(places.face_idx, places.barycentric, source.mesh.vertices) - frame[0], unit(frame[1])
             )
         certain = out.pop("confidence", None)
         if options.confidence:
@@ -230,7 +230,7 @@ def occlusion_tracer(
         def run(part: slice) -> np.ndarray:
             points, facing, _, _ = surface_at(target, face_idx[part], barycentric[part])
             places = reproject(points, unit(facing), reach[face_idx[part]], source)
-            at = source.at(places.face_idx, places.barycentric, source.vertices)
+            at = source.at(places.face_idx, places.barycentric, source.mesh.vertices)
             geometric = source.face_normals[places.face_idx] * np.where(places.from_behind, -1, 1)[:, None]
             smooth = source.at(places.face_idx, places.barycentric, normals)
             side = dot(smooth, geometric)[:, None]

@@ -63,12 +63,12 @@ class Source:
     def __init__(self, mesh: TriMesh):
         from gdtool.geometry.single_precision_rays import SinglePrecisionCaster
 
-        self.vertices, self.faces = np.asarray(mesh.vertices, np.float64), mesh.faces
+        self.mesh = TriMesh(np.asarray(mesh.vertices, np.float64), mesh.faces)
         self.face_normals = face_normals(mesh)[0]
         self._normal_rows = np.ascontiguousarray(self.face_normals.T, np.float32)
-        self.extent = float(np.ptp(self.vertices, axis=0).max())
+        self.extent = self.mesh.extent
         self.caster = SinglePrecisionCaster(mesh)
-        self.nearest = Nearest(TriMesh(self.vertices, self.faces))
+        self.nearest = Nearest(self.mesh)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
 
@@ -79,13 +79,13 @@ class Source:
     @cached_property
     def twins(self) -> np.ndarray:
         """Find for each face the one with the same corners that faces the other way: (f,) int32, -1 without one."""
-        corners = np.sort(number_distinct_rows(self.vertices)[self.faces], axis=1)
+        corners = np.sort(number_distinct_rows(self.mesh.vertices)[self.mesh.faces], axis=1)
         order = np.lexsort(corners.T)
         first, second = order[:-1], order[1:]
         same = (corners[first] == corners[second]).all(1)
         paired = same & (dot(self.face_normals[first], self.face_normals[second]) < 0)
         first, second = first[paired], second[paired]
-        out = np.full(len(self.faces), -1, np.int32)
+        out = np.full(len(self.mesh.faces), -1, np.int32)
         out[first], out[second] = second, first
         return out
 
@@ -94,7 +94,7 @@ class Source:
         with self._lock:
             if (axis, sign) not in self._facing:
                 chosen = np.flatnonzero(self.face_normals[:, axis] * sign > 0.25)
-                self._facing[axis, sign] = Nearest(TriMesh(self.vertices, self.faces), chosen) if len(chosen) else None
+                self._facing[axis, sign] = Nearest(self.mesh, chosen) if len(chosen) else None
             return self._facing[axis, sign]
 
     def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
@@ -111,7 +111,7 @@ class Source:
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Interpolate vertex values (v,) or (v, c) at places on faces: (n,) or (n, c)."""
-        corners = values[self.faces[face_idx]]
+        corners = values[self.mesh.faces[face_idx]]
         return np.einsum("nk,nk...->n...", barycentric.astype(corners.dtype, copy=False), corners)
 
 
@@ -215,15 +215,15 @@ def _nearest_agreeing(
     sign = np.sign(normals[wrong, axis])
     for k in range(3):
         for s in (-1.0, 1.0):
-            mine = wrong[(axis == k) & (sign == s)]
-            among = source.facing(k, s) if len(mine) else None
+            rows = wrong[(axis == k) & (sign == s)]
+            among = source.facing(k, s) if len(rows) else None
             if among is None:
                 continue
-            other_face, other_point = among.closest(points[mine])
-            apart, other_apart = (np.linalg.norm(at - points[mine], axis=1) for at in (point[mine], other_point))
-            sheet = (apart <= reach[mine]) & (other_apart > reach[mine])
-            better = (dot(source.face_normals[other_face], normals[mine]) > AGREEMENT) & ~sheet
-            face[mine[better]], point[mine[better]] = other_face[better], other_point[better]
+            other_face, other_point = among.closest(points[rows])
+            apart, other_apart = (np.linalg.norm(at - points[rows], axis=1) for at in (point[rows], other_point))
+            sheet = (apart <= reach[rows]) & (other_apart > reach[rows])
+            better = (dot(source.face_normals[other_face], normals[rows]) > AGREEMENT) & ~sheet
+            face[rows[better]], point[rows[better]] = other_face[better], other_point[better]
     return face, point
 
 
@@ -238,7 +238,7 @@ def _slide_off_edges(
     """
     cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
-    away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
+    away = source.at(face[slanted], barycentric[slanted], source.mesh.vertices) - points[slanted]
     # Distance from the hit to the nearest place, if the face were a plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
     slanted = slanted[beside > 2e-5 * source.extent]
@@ -248,7 +248,7 @@ def _slide_off_edges(
     agrees = dot(source.face_normals[nearest_face], normals[slanted]) > AGREEMENT
     slanted, nearest_face, nearest = slanted[agrees], nearest_face[agrees], nearest[agrees]
     face[slanted] = nearest_face
-    barycentric[slanted] = barycentric_of(nearest, source.vertices[source.faces[nearest_face]])
+    barycentric[slanted] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[nearest_face]])
 
 
 def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
@@ -260,8 +260,8 @@ def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric
         return
     twin = source.twins[face[places]]
     places, twin = places[twin >= 0], twin[twin >= 0]
-    at = source.at(face[places], barycentric[places], source.vertices)
-    face[places], barycentric[places] = twin, barycentric_of(at, source.vertices[source.faces[twin]])
+    at = source.at(face[places], barycentric[places], source.mesh.vertices)
+    face[places], barycentric[places] = twin, barycentric_of(at, source.mesh.vertices[source.mesh.faces[twin]])
 
 
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
@@ -274,12 +274,12 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
     # Between two sheets that face the same way lies a third: outward there is nothing nearer than so near a hit.
-    rest = np.flatnonzero(distance > 5e-4 * source.extent)
+    far = np.flatnonzero(distance > 5e-4 * source.extent)
     out_face, out_distance, out_at, _ = _march(
-        points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start
+        points[far], normals[far], normals[far], np.minimum(reach, distance)[far], source, start
     )
-    outward = (out_face >= 0) & (out_distance < distance[rest])
-    face[rest[outward]], distance[rest[outward]], barycentric[rest[outward]] = (
+    outward = (out_face >= 0) & (out_distance < distance[far])
+    face[far[outward]], distance[far[outward]], barycentric[far[outward]] = (
         out_face[outward],
         out_distance[outward],
         out_at[outward],
@@ -290,7 +290,7 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     missed = np.flatnonzero(face < 0)
     if len(missed):
         face[missed], nearest = _nearest_agreeing(points[missed], normals[missed], reach[missed], source)
-        barycentric[missed] = barycentric_of(nearest, source.vertices[source.faces[face[missed]]])
+        barycentric[missed] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[face[missed]]])
     by_ray, from_behind = np.ones(len(points), bool), np.zeros(len(points), bool)
     by_ray[missed] = False
     _slide_off_edges(points, normals, source, by_ray, face, barycentric)

@@ -18,7 +18,6 @@ from gdtool.bake.target import Target, Texels, fineness, texel_width, texels_of
 from gdtool.core.errors import InputError
 from gdtool.core.sources import Source
 from gdtool.core.stage import Output
-from gdtool.geometry.meshes import TriMesh
 
 # World units; a source whose detail is finer counts as this fine.
 FINEST_DETAIL = 1e-12
@@ -58,7 +57,7 @@ def read_source(
     for what, why in choice.skipped:
         out.skip(what, why)
     if turned:
-        out.warn(f"{name}: what it is baked from is inside out beside it; the faces are taken the other way round")
+        out.warn(f"{name}: the source of the bake is inside out compared with it; the source's faces are flipped")
     return origin
 
 
@@ -72,7 +71,7 @@ def rasterise(
     size, samples = fineness(target, origin.detail, options.size, options.samples)
     if options.samples is None and samples == 1:
         times = texel_width(target, size) / max(origin.detail, FINEST_DETAIL)
-        out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one stands for it")
+        out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one sample is enough")
     require_map_memory(name, size)
     with out.step("rasterise"):
         texels = texels_of(target, size, threads=out.threads)
@@ -89,9 +88,9 @@ def bake_maps(
     Returns the maps and the report's figures.
     """
     with out.step("bake"):
-        reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
-        how = BakeOptions(samples, out.threads, options.height, options.confidence)
-        baked = bake(target, texels, origin.source, origin.lookup, reach, how, out.progress)
+        reach = vertex_reach(target.mesh, origin.source)
+        bake_options = BakeOptions(samples, out.threads, options.height, options.confidence)
+        baked = bake(target, texels, origin.source, origin.lookup, reach, bake_options, out.progress)
     occlusion = None
     if options.occlusion_rays:
         with out.step("occlusion"):

@@ -74,12 +74,11 @@ class CornerNormals(NamedTuple):
 class Target:
     """Triangles with texture coordinates and the frames that a normal map is encoded in.
 
-    vertices (v, 3), faces (t, 3); uv (c, 2) with (0, 0) at the image's top left, face_uvs (t, 3) into uv; normals
-    (t, 3, 3) unit and tangents (t, 3, 4) of the corners.
+    mesh: vertices (v, 3), faces (t, 3). uv (c, 2), with (0, 0) at the image's top left; face_uvs (t, 3) into uv.
+    normals (t, 3, 3) unit and tangents (t, 3, 4) of the triangles' corners.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     uv: np.ndarray
     face_uvs: np.ndarray
     normals: np.ndarray
@@ -94,16 +93,15 @@ class Target:
         crease_degrees: float = CREASE_DEGREES,
     ) -> Target:
         """Make the target of a triangle mesh: smooth normals split at creases, and MikkTSpace tangents."""
-        vertices, faces = mesh.vertices, mesh.faces
         normals = corner_normals(mesh, crease_degrees)
-        normal_idx = np.arange(len(faces) * 3).reshape(-1, 3)
+        normal_idx = np.arange(len(mesh.faces) * 3).reshape(-1, 3)
         tangents = corner_tangents(mesh, normals.reshape(-1, 3), uv, face_uvs, normal_idx)
-        return cls(vertices, faces, uv, face_uvs, normals, tangents)
+        return cls(mesh, uv, face_uvs, normals, tangents)
 
     @cached_property
     def packed(self) -> np.ndarray:
         """Gather the corners of the triangles as (3, 10, t) float32: position, normal, tangent and its handedness."""
-        corners = np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1)
+        corners = np.concatenate([self.mesh.vertices[self.mesh.faces], self.normals, self.tangents], -1)
         return np.ascontiguousarray(corners.transpose(1, 2, 0), np.float32)
 
 
@@ -201,7 +199,7 @@ def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> 
 
 def texel_width(target: Target, size: int) -> float:
     """Compute the mean width of a texel of a size x size map on the target, in its units: √(area / texels)."""
-    area = face_normals(TriMesh(target.vertices, target.faces))[1].sum()
+    area = target.mesh.area
     u, v = (target.uv[target.face_uvs[:, k]] - target.uv[target.face_uvs[:, 0]] for k in (1, 2))
     covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     return float(np.sqrt(area / max(covered, 1e-12)) / size)

@@ -87,8 +87,10 @@ def accept_good_pieces(patch: RemeshPatch, whole: Candidate | None) -> tuple[Qua
     if not good.any():
         return None, good
     result = QuadResult(concatenate_meshes([made[k] for k in np.flatnonzero(good)]), whole.attempt.label)
-    rest = patch.quads * patch.piece_areas[~good].sum() / patch.piece_areas.sum()
-    if abs(patch.quads - len(result.mesh.faces) - rest) > max(COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * rest):
+    missing_quads = patch.quads * patch.piece_areas[~good].sum() / patch.piece_areas.sum()
+    if abs(patch.quads - len(result.mesh.faces) - missing_quads) > max(
+        COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * missing_quads
+    ):
         return None, np.zeros_like(good)  # the other pieces could not make up for this count
     return result, good
 
@@ -110,11 +112,11 @@ def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[
     alone = np.argsort(-share, kind="stable")[:_MAX_ALONE]
     counts = np.maximum(quads * share, least)[alone]
     large = (share[alone] > 0) & (counts >= _MIN_QUADS_ALONE)
-    alone, counts, rest = alone[large], counts[large], ~done
-    rest[alone] = False
+    alone, counts, is_small = alone[large], counts[large], ~done
+    is_small[alone] = False
     patches = []
-    if rest.any():
-        patches.append(patch.subset(rest[piece], max(int(quads * share[rest].sum()), 1), skip_engines=True))
+    if is_small.any():
+        patches.append(patch.subset(is_small[piece], max(int(quads * share[is_small].sum()), 1), skip_engines=True))
         quads -= split_count(patches[0].mesh.faces, patches[0].quads)
     counts = np.maximum((counts * (quads / max(counts.sum(), 1))).round().astype(int), _MIN_PIECE_QUADS)
     spare = max(COUNT_TOLERANCE * patch.quads - _MIN_TOLERANCE * counts.sum(), 0)

@@ -109,7 +109,7 @@ def count_reason(
     """
     pieces = topology.components(faces)[0]
     if made < asked:
-        reason = "no way that was tried came nearer to the count"
+        reason = "no method that was tried came nearer to the count"
     elif asked < min_of_a_piece * pieces:
         reason = f"it has {pieces} separate pieces, and each takes at least {min_of_a_piece} faces or so"
     elif asked < _FACES_OF_A_HANDLE * (handles := topology.handles(faces, pieces)):

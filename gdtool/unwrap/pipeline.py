@@ -147,7 +147,7 @@ def _flatten_in_child(
     except ChildFailed as failure:
         until = time.monotonic() + deadlines.projected - deadlines.shaped
         charts, reasons = flatten_all(mesh, segmentation.label, replace(limits, single_after=until))
-        return charts, [f"flattening: {failure}; charts by the side they look at", *reasons]
+        return charts, [f"flattening: {failure}; charts are made by the side of a box that faces look at", *reasons]
 
 
 def _cut_for_packing(
@@ -173,8 +173,8 @@ def _cut_for_packing(
     if best.skipped:
         skipped.append(
             Skipped(
-                f"packing {best.skipped} ways to cut",
-                "the charts before filled too little of the square",
+                f"packing {best.skipped} sets of charts that are cut further",
+                "the sets before them filled too little of the square",
                 best.skipped * took / (len(tried) - best.skipped),
             )
         )

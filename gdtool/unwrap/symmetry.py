@@ -48,6 +48,6 @@ def copy_twin_corners(face_uvs: np.ndarray, kept: np.ndarray, twin: np.ndarray, 
     out = np.full(corner.shape, -1, face_uvs.dtype)
     out[kept] = face_uvs
     other = np.flatnonzero(twin >= 0)
-    taken = np.take_along_axis(out[twin[other]], np.maximum(corner[other], 0), 1)
-    out[other] = np.where(corner[other] >= 0, taken, -1)
+    twin_corners = np.take_along_axis(out[twin[other]], np.maximum(corner[other], 0), 1)
+    out[other] = np.where(corner[other] >= 0, twin_corners, -1)
     return out

@@ -20,9 +20,9 @@ def test_a_level_has_the_requested_triangles_and_keeps_its_texels():
     same = drift(full, full)
     assert same["drift_p99"] < 2e-3
     assert same["outside"] == 0
-    level, why = coarser(full, len(full.faces) // 2)
+    level, why = coarser(full, len(full.mesh.faces) // 2)
     assert why == ""
-    assert abs(len(level.faces) - len(full.faces) // 2) <= 2
+    assert abs(len(level.mesh.faces) - len(full.mesh.faces) // 2) <= 2
     # A quarter of a triangle's edge at most, and no part of the surface that reads another chart.
     found = drift(level, full)
     assert found["drift_mean"] < 0.008
@@ -56,20 +56,22 @@ def _span(full):
 def test_a_level_that_drifts_on_its_maps_is_left_out(monkeypatch):
     full = target()
     # A level whose texture corners are those of the opposite side.
-    half, _ = coarser(full, len(full.faces) // 2)
-    wrong = replace(half, vertices=half.vertices * (-1, 1, 1))
-    monkeypatch.setattr(lods, "coarser", lambda target, n: (wrong, "") if n == len(full.faces) // 2 else (half, ""))
+    half, _ = coarser(full, len(full.mesh.faces) // 2)
+    wrong = replace(half, mesh=TriMesh(half.mesh.vertices * (-1, 1, 1), half.mesh.faces))
+    monkeypatch.setattr(
+        lods, "coarser", lambda target, n: (wrong, "") if n == len(full.mesh.faces) // 2 else (half, "")
+    )
     made = make_levels(full, 3)
     assert made.targets == [half]
-    assert made.report["lod1_triangles"] == len(half.faces)
+    assert made.report["lod1_triangles"] == len(half.mesh.faces)
     assert made.report["lod1_drift_mean"] < 8e-3
     assert len(made.skipped) == 1
-    assert "slide" in made.skipped[0][1]
+    assert "would drift" in made.skipped[0][1]
 
 
 def test_a_level_with_too_many_triangles_is_kept_if_coarser_than_the_last(monkeypatch):
     full = target()
-    count = len(full.faces)
+    count = len(full.mesh.faces)
     levels = {
         count // 2: coarser(full, count // 2)[0],
         count // 4: coarser(full, int(0.4 * count))[0],
@@ -81,4 +83,4 @@ def test_a_level_with_too_many_triangles_is_kept_if_coarser_than_the_last(monkey
     assert len(made.warnings) == 1
     assert "fewer would tear a seam" in made.warnings[0]
     assert len(made.skipped) == 1
-    assert f"fewer than {len(levels[count // 8].faces)} triangles" in made.skipped[0][1]
+    assert f"fewer than {len(levels[count // 8].mesh.faces)} triangles" in made.skipped[0][1]

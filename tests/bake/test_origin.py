@@ -38,7 +38,7 @@ def places_on(surface, count=4000):
 
 
 def at(origin, places):
-    return origin.source.at(places.face_idx, places.barycentric, origin.source.vertices)
+    return origin.source.at(places.face_idx, places.barycentric, origin.source.mesh.vertices)
 
 
 def test_views_give_what_they_see_and_vertices_everything_else(surface):

@@ -84,7 +84,7 @@ def test_the_view_that_the_others_were_generated_from_is_not_outvoted():
     picture = picture_of(np.concatenate([albedo[0], views.mask[0, ..., None]], -1), views.cameras[0], albedo[0])
     places = _front_places(vertices, triangles_of(quads), normals)
     fading, known = (from_surface(surface, given, picture=one) for one in (None, picture))
-    points = known.source.at(places.face_idx, places.barycentric, known.source.vertices)
+    points = known.source.at(places.face_idx, places.barycentric, known.source.mesh.vertices)
     errors = [np.abs(one.lookup(places)["albedo"] - albedo_of(points)).mean() for one in (fading, known)]
     assert errors[1] < 0.05
     assert errors[1] < 0.5 * errors[0]

@@ -72,7 +72,7 @@ def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus
 
     # Above the middle stripes finer than a texel, whose mean is one half; below it one half everywhere.
     def stripes(places):
-        y = source.at(places.face_idx, places.barycentric, source.vertices)[:, 1:2]
+        y = source.at(places.face_idx, places.barycentric, source.mesh.vertices)[:, 1:2]
         count = len(places.face_idx)
         return {
             "albedo": np.repeat(np.where(y > 0, (np.sin(900 * y) > 0) * 1.0, 0.5), 3, 1),

@@ -17,7 +17,7 @@ def box(size):
 
 def at(source, places):
     """Compute the positions (n, 3) of places on a source."""
-    return source.at(places.face_idx, places.barycentric, source.vertices)
+    return source.at(places.face_idx, places.barycentric, source.mesh.vertices)
 
 
 def test_sphere_inside_and_outside_points_meet_it_along_the_normal():

@@ -33,7 +33,7 @@ def plate(material, left=4.0, right=28.0, samples=16, threads=1):
     )
 
     def lookup(places):
-        x = source.at(places.face_idx, places.barycentric, source.vertices)[:, 0]
+        x = source.at(places.face_idx, places.barycentric, source.mesh.vertices)[:, 0]
         plain = {
             "albedo": np.full((len(x), 3), 0.5),
             "roughness": np.full(len(x), 0.5),

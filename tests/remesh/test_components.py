@@ -50,7 +50,7 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
 
 @pytest.mark.parametrize("hopeless", [False, True])
 def test_good_pieces_of_an_engines_result_are_kept(monkeypatch, hopeless):
-    """There are more pieces than are remeshed one by one. If engines fail on one, that one alone is paired triangles."""
+    """There are too many pieces to remesh them one by one. If engines fail on one, it alone is paired triangles."""
     ball, large = sphere(64, 0.09), sphere(48, 0.3)
     balls = [(ball[0] + (0.22 * i, 0.22 * j, 0), ball[1]) for i in range(5) for j in range(4)]
     vertices, faces = joined(*balls, (large[0] + (0.4, 0.3, 0.5), large[1]))

@@ -94,8 +94,10 @@ def test_a_much_nearer_candidate_goes_before_a_doubtful_one(tops, wanted, order)
 
 
 def test_quads_that_leave_out_surface_are_rejected_before_fitting(monkeypatch):
-    """Half a ball is rejected, not asked for another count; a whole ball passes, and one whose missing cap tips can
-    cover."""
+    """Half a ball is rejected, and no other count is requested.
+
+    A whole ball passes, and so does one whose missing cap can be covered by tip extrusion.
+    """
     vertices, faces = sphere(24, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces

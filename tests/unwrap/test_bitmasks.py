@@ -102,7 +102,7 @@ def test_upright_is_the_smallest_rectangle_with_its_longer_side_along_u():
 
 
 def test_orders_are_not_searched_where_charts_cannot_be_separated(monkeypatch):
-    """Orders are searched with cells that count from any share of a chart on, once charts with larger shares collide."""
+    """Charts cannot be separated here: the first share of a cell is skipped, the other two are searched for orders."""
     from gdtool.unwrap.pack import search
 
     sides = np.random.default_rng(3).uniform(1, 5, (14, 2))

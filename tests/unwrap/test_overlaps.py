@@ -14,8 +14,10 @@ from tests.unwrap.test_merge import GOOD, sheet
 
 
 def spiral(turns, around=120, across=6):
-    """Make a spiral band of quads: vertices (v, 3), faces, and its flat coordinates (v, 2), which overlap past one
-    turn."""
+    """Make a spiral band of quads: vertices (v, 3), faces (f, 4), and flat coordinates (v, 2).
+
+    The flat coordinates overlap where there is more than one turn.
+    """
     angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi * turns, around + 1), np.linspace(0.5, 0.6, across + 1))
     uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
     row, column = (x.ravel() for x in np.mgrid[:across, :around])
@@ -47,8 +49,7 @@ def test_a_disk_whose_rim_does_not_cross_itself_has_no_overlap():
 
 @pytest.mark.parametrize("past", [0.0, 20.0])
 def test_a_rim_may_cross_itself_where_two_of_its_corners_coincide(past):
-    """A fan of triangles all around a boundary corner, whose ends meet in one place; in one case they run past each
-    other."""
+    """A fan of triangles all around a corner, whose two ends meet in one place or run past each other."""
     degrees, length = np.array([-past, *range(0, 361, 30), 360 + past]), np.array([0.6, *[1.0] * 13, 0.6])
     uv = np.concatenate(
         [[[0, 0]], length[:, None] * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)]

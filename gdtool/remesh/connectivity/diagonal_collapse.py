@@ -71,15 +71,15 @@ def collapse_folded_quads(
                 or len(np.intersect1d(face_lists[keep], face_lists[lose])) > 1
             ):
                 continue
-            rest = faces[around[around != quad]]
-            moves = (rest == keep) | (rest == lose)
+            other_faces = faces[around[around != quad]]
+            moves = (other_faces == keep) | (other_faces == lose)
             positions = out[[keep]]
             if free[keep]:
                 positions = np.concatenate(
                     [positions, out[[lose]], surface.closest(out[[keep, lose]].mean(0, keepdims=True))[2]]
                 )
             for position in positions:
-                corners = np.where(moves[..., None], position, out[rest]).reshape(-1, 3)
+                corners = np.where(moves[..., None], position, out[other_faces]).reshape(-1, 3)
                 worst = scaled_jacobian(QuadMesh(corners, np.arange(len(corners)).reshape(-1, 4))).min()
                 if worst > (best.quality if best else quality[around].min() + _MIN_GAIN):
                     all_touched = np.concatenate([around, face_lists[side], face_lists[other]])

@@ -438,17 +438,17 @@ def release_straight_corners(mesh: QuadMesh, constraints: Constraints) -> Constr
     vertices, faces = mesh.vertices, mesh.faces
     curve, fixed, path = constraints.curve.copy(), constraints.fixed.copy(), np.sort(constraints.path, 1)
     width = len(vertices) + 1
-    kept = np.ones(len(path), bool)
+    remaining = np.ones(len(path), bool)
     corner = faces[faces[:, 3] >= 0]
     after, before = np.roll(corner, -1, 1), np.roll(corner, 1, 1)
     straight = corner_jacobians(QuadMesh(vertices, corner), polygon_normals(QuadMesh(vertices, corner))[0]) < _STRAIGHT
 
     def on_path(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[kept])
+        return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[remaining])
 
     between = on_path(corner, after) & on_path(before, corner)
     # At a corner of the features the angle is the surface's own: it is released only where it is straight or folded.
     release = np.unique(corner[between & (straight | ~fixed[corner])])
     curve[release], fixed[release] = -1, False
-    kept &= ~np.isin(path, release).any(1)
-    return Constraints(curve, fixed, constraints.path[kept], constraints.path_curve[kept])
+    remaining &= ~np.isin(path, release).any(1)
+    return Constraints(curve, fixed, constraints.path[remaining], constraints.path_curve[remaining])

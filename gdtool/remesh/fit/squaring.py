@@ -192,11 +192,11 @@ def release_and_smooth(
     corners stay. tips: vertices that always stay. Returns vertices and constraints.
     """
     vertices, faces = mesh.vertices, mesh.faces
-    in_vain, left = 0, np.inf
+    in_vain, bad_count = 0, np.inf
     for turn in range(_RELEASE_ROUNDS):
         bad = scaled_jacobian(QuadMesh(vertices, faces)) < options.min_jacobian
-        in_vain, left = in_vain + 1 if bad.sum() > _MOST_LEFT * left else 0, bad.sum()
-        if not left or in_vain == _MAX_ROUNDS_IN_VAIN and left > _FEW_BAD:
+        in_vain, bad_count = in_vain + 1 if bad.sum() > _MOST_LEFT * bad_count else 0, bad.sum()
+        if not bad_count or in_vain == _MAX_ROUNDS_IN_VAIN and bad_count > _FEW_BAD:
             break
         near = np.zeros(len(vertices), bool)
         near[faces[bad]] = True
@@ -249,12 +249,12 @@ def _smooth_region(
 
 def _released(constraints: Constraints, released: np.ndarray) -> Constraints:
     """Remove some vertices, released (v,) bool, and the path edges at them from constraints."""
-    kept = ~released[constraints.path].any(1)
+    remaining = ~released[constraints.path].any(1)
     return Constraints(
         np.where(released, -1, constraints.curve),
         constraints.fixed & ~released,
-        constraints.path[kept],
-        constraints.path_curve[kept],
+        constraints.path[remaining],
+        constraints.path_curve[remaining],
     )
 
 

@@ -268,7 +268,7 @@ def _extend_constraints(constraints: Constraints, count: int, moved: np.ndarray,
 def _remaining_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
     """Drop path edges that are no longer edges of the faces, or no longer held at both ends."""
     ends, path, width = edges_of(faces).ends, np.sort(constraints.path, 1), len(constraints.curve) + 1
-    kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
+    remaining = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
         constraints.curve[path] >= 0
     ).all(1)
-    return replace(constraints, path=constraints.path[kept], path_curve=constraints.path_curve[kept])
+    return replace(constraints, path=constraints.path[remaining], path_curve=constraints.path_curve[remaining])

@@ -108,8 +108,8 @@ def _independent_batches(chosen: np.ndarray, faces: np.ndarray, face_lists: Grou
     batches: list[list[int]] = []
     color: dict[int, int] = {}
     for v in chosen.tolist():
-        taken = {color.get(u) for u in faces[face_lists[v]].ravel().tolist()}
-        color[v] = next(c for c in range(len(taken) + 1) if c not in taken)
+        used_colors = {color.get(u) for u in faces[face_lists[v]].ravel().tolist()}
+        color[v] = next(c for c in range(len(used_colors) + 1) if c not in used_colors)
         if color[v] == len(batches):
             batches.append([])
         batches[color[v]].append(v)
@@ -123,7 +123,7 @@ def _candidate_positions(
 
     quads (n, k, 4) and neighbours (n, m) around them.
     """
-    here, beside = vertices[batch][:, None], vertices[neighbour_idx]
+    present, beside = vertices[batch][:, None], vertices[neighbour_idx]
     mean = beside.mean(1, keepdims=True)
     radius = np.linalg.norm(beside - mean, axis=2).mean(1)[:, None, None]
     axes = np.linalg.svd(beside - mean, full_matrices=False)[2]
@@ -134,12 +134,12 @@ def _candidate_positions(
     )
     return np.concatenate(
         [
-            here,
+            present,
             mean,
             vertices[quads].mean((1, 2))[:, None],
-            (mean + here) / 2,
-            here + _NEAR_RING * radius * circle,
-            here + _FAR_RING * radius * circle,
+            (mean + present) / 2,
+            present + _NEAR_RING * radius * circle,
+            present + _FAR_RING * radius * circle,
         ],
         1,
     )

@@ -231,7 +231,7 @@ def _improvement_chain(masks: ChartMasks, best: Layout, tries: int, seed: int, u
 
     tries: the number of changed orders. until: when the search stops, on the clock time.monotonic.
     """
-    rng, found = np.random.default_rng(seed), []  # fixed seeds: equal input gives equal output
+    rng, layouts = np.random.default_rng(seed), []  # fixed seeds: equal input gives equal output
     known: dict[tuple[int, float], dict] = {}
     for _ in range(tries):
         if time.monotonic() > until:
@@ -251,8 +251,8 @@ def _improvement_chain(masks: ChartMasks, best: Layout, tries: int, seed: int, u
         )
         if layout is not None:
             best = layout
-            found.append(layout)
-    return found
+            layouts.append(layout)
+    return layouts
 
 
 def _place_in_order(

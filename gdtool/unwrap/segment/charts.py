@@ -247,11 +247,11 @@ def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tu
         apart = a != b
         pair = np.concatenate([np.stack([a, b], -1)[apart], np.stack([b, a], -1)[apart]])
         weight = np.concatenate([adjacency.cost[apart]] * 2)
-        mine = small[pair[:, 0]]
-        if not mine.any():
+        from_small = small[pair[:, 0]]
+        if not from_small.any():
             break
-        key, inverse = np.unique(pair[mine][:, 0] * len(area) + pair[mine][:, 1], return_inverse=True)
-        total = np.bincount(inverse.ravel(), weight[mine])
+        key, inverse = np.unique(pair[from_small][:, 0] * len(area) + pair[from_small][:, 1], return_inverse=True)
+        total = np.bincount(inverse.ravel(), weight[from_small])
         merged_into = np.arange(len(area))
         for k in np.argsort(total, kind="stable").tolist():
             merged_into[key[k] // len(area)] = key[k] % len(area)

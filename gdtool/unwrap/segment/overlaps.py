@@ -77,7 +77,7 @@ def give_to_neighbours(
     sides = number[adjacency.pairs]
     rim = np.flatnonzero(sides[:, 0] != sides[:, 1])
     rows_of = _rows_by_number(sides[rim].T.ravel(), np.tile(rim, 2), len(pieces))
-    left, work = [], 0
+    unplaced, work = [], 0
     by_size = sorted(zip(rows_of, pieces, strict=True), key=lambda pair: len(pair[1].faces_idx), reverse=True)
     for rows, piece in by_size:
         beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
@@ -99,8 +99,8 @@ def give_to_neighbours(
                 charts[i], owner[piece.faces_idx] = Chart(faces_idx, both.faces, uv, triangles.faces), i
                 break
         else:
-            left.append(piece)
-    return left
+            unplaced.append(piece)
+    return unplaced
 
 
 def _extend_chart(both: QuadMesh, triangles: TriMesh, chart: Chart, max_stretch: float) -> np.ndarray | None:
