@@ -71,7 +71,7 @@ def test_no_seam_shows(stored):
     seams = Seams(SimpleNamespace(target=target, material=material), SIZE)
     for name, image in maps.items():
         assert seams.ratio(name, image) <= 1.2
-        bare = np.zeros_like(image)
+        without_gutters = np.zeros_like(image)
         inside = texels.texel[: texels.inside]
-        bare.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
-        assert seams.ratio(name, bare) > 1.2
+        without_gutters.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
+        assert seams.ratio(name, without_gutters) > 1.2

@@ -24,9 +24,9 @@ def test_a_level_has_the_requested_triangles_and_keeps_its_texels():
     assert why == ""
     assert abs(len(level.mesh.faces) - len(full.mesh.faces) // 2) <= 2
     # A quarter of a triangle's edge at most, and no part of the surface that reads another chart.
-    found = drift(level, full)
-    assert found["drift_mean"] < 0.008
-    assert found["outside"] < 0.01
+    drifted = drift(level, full)
+    assert drifted["drift_mean"] < 0.008
+    assert drifted["outside"] < 0.01
     # Every chart turns the way it did: a mirrored one would turn its normal map round.
     u, v = (level.uv[level.face_uvs[:, k]] - level.uv[level.face_uvs[:, 0]] for k in (1, 2))
     whole_u, whole_v = (full.uv[full.face_uvs[:, k]] - full.uv[full.face_uvs[:, 0]] for k in (1, 2))

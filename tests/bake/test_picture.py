@@ -66,8 +66,8 @@ def test_points_read_the_pixels_that_show_them(camera):
     points = rng.uniform(-0.3, 0.3, (50, 3))
     ramp = np.stack(np.broadcast_arrays(*np.meshgrid(np.arange(FINE) + 0.5, np.arange(FINE) + 0.5), 1.0), -1)
     albedo, picture, _ = shown(np.full((FINE, FINE, 3), 0.5), np.ones((FINE, FINE)))
-    found = replace(picture_of(picture, camera, albedo), factor=ramp.astype(np.float32)).at(points)
-    np.testing.assert_allclose(found[:, :2], project(camera, points)[0] * FINE / COARSE, atol=1e-3)
+    factors = replace(picture_of(picture, camera, albedo), factor=ramp.astype(np.float32)).at(points)
+    np.testing.assert_allclose(factors[:, :2], project(camera, points)[0] * FINE / COARSE, atol=1e-3)
 
 
 def test_the_view_that_the_others_were_generated_from_is_not_outvoted():
@@ -80,16 +80,18 @@ def test_the_view_that_the_others_were_generated_from_is_not_outvoted():
     )
     albedo = np.where(views.mask[..., None] > 0, np.full(3, 0.5), 0).astype(np.float32)
     albedo[0] = views.images["albedo"][0]
-    given = Views(views.cameras, {"albedo": albedo}, views.mask)
+    changed_views = Views(views.cameras, {"albedo": albedo}, views.mask)
     picture = picture_of(np.concatenate([albedo[0], views.mask[0, ..., None]], -1), views.cameras[0], albedo[0])
     places = _front_places(vertices, triangles_of(quads), normals)
-    fading, known = (from_surface(surface, given, picture=one) for one in (None, picture))
-    points = known.source.at(places.face_idx, places.barycentric, known.source.mesh.vertices)
-    errors = [np.abs(one.lookup(places)["albedo"] - albedo_of(points)).mean() for one in (fading, known)]
+    without_picture, with_picture = (from_surface(surface, changed_views, picture=one) for one in (None, picture))
+    points = with_picture.source.at(places.face_idx, places.barycentric, with_picture.source.mesh.vertices)
+    errors = [
+        np.abs(one.lookup(places)["albedo"] - albedo_of(points)).mean() for one in (without_picture, with_picture)
+    ]
     assert errors[1] < 0.05
     assert errors[1] < 0.5 * errors[0]
-    assert "picture: albedo" in known.label
-    assert "picture" not in fading.label
+    assert "picture: albedo" in with_picture.label
+    assert "picture" not in without_picture.label
 
 
 def _front_places(vertices, faces, normals):

@@ -81,9 +81,9 @@ def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus
             "normal": source.face_normals[places.face_idx],
         }
 
-    one = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
+    single = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
     many = bake(target, texels, source, stripes, reach, BakeOptions(samples=16))
-    assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
+    assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(single - 0.5).mean()
     assert 0.4 < many.report["supersampled_share"] < 0.9
 
 

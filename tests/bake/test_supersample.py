@@ -97,23 +97,24 @@ def ring():
 
 
 def test_any_number_of_threads_gives_equal_values(ring):
-    one, three = (bake(*ring, BakeOptions(4, threads)) for threads in (1, 3))
-    assert one.report == three.report
-    assert 0.02 < one.report["supersampled_share"] < 0.98
-    for name, value in one.values.items():
+    single, three = (bake(*ring, BakeOptions(4, threads)) for threads in (1, 3))
+    assert single.report == three.report
+    assert 0.02 < single.report["supersampled_share"] < 0.98
+    for name, value in single.values.items():
         np.testing.assert_array_equal(value, three.values[name])
 
 
 def test_texels_left_with_one_sample_are_within_the_tolerance(ring, monkeypatch):
     texels = ring[1]
     some = bake(*ring, BakeOptions(4)).values
-    left = np.setdiff1d(np.arange(texels.inside), supersample.varying(texels, bake(*ring).values))
+    unvaried = np.setdiff1d(np.arange(texels.inside), supersample.varying(texels, bake(*ring).values))
     monkeypatch.setattr(supersample, "varying", lambda texels, values, threads: np.arange(len(texels)))
     every = bake(*ring, BakeOptions(4)).values
-    assert len(left) > 100
+    assert len(unvaried) > 100
     assert (
-        np.abs(srgb_from_linear(some["albedo"]) - srgb_from_linear(every["albedo"]))[left].max() < supersample.TOLERANCE
+        np.abs(srgb_from_linear(some["albedo"]) - srgb_from_linear(every["albedo"]))[unvaried].max()
+        < supersample.TOLERANCE
     )
     for name in ("roughness", "tangent_normal"):
-        assert np.abs(some[name] - every[name])[left].max() < supersample.TOLERANCE
+        assert np.abs(some[name] - every[name])[unvaried].max() < supersample.TOLERANCE
     assert np.abs(some["roughness"] - bake(*ring).values["roughness"]).max() > 0.2

@@ -62,9 +62,11 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
 
 def test_views_that_agree_are_left_alone(seen):
     step = grid_step([prepared_view.camera for prepared_view in seen], 0)
-    one, two = (fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front"))
-    assert two.restored == 0
-    assert np.array_equal(one.vertices, two.vertices)
+    plain, with_picture = (
+        fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front")
+    )
+    assert with_picture.restored == 0
+    assert np.array_equal(plain.mesh.vertices, with_picture.mesh.vertices)
 
 
 def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):

@@ -37,10 +37,10 @@ def in_this_process(monkeypatch, engine=None) -> list:
     """
     calls = []
 
-    def begin(_, *given, **limits):
-        calls.append(given)
+    def begin(_, *arguments, **limits):
+        calls.append(arguments)
         try:
-            return Ended(candidates.make_candidate(*given))
+            return Ended(candidates.make_candidate(*arguments))
         except ChildFailed as failure:
             return Ended(failure)
 

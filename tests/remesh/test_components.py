@@ -78,8 +78,8 @@ def test_good_pieces_of_an_engines_result_are_kept(monkeypatch, hopeless):
     )
 
 
-@pytest.mark.parametrize("wanted, kept", [(1.0, True), (1.2, False)])
-def test_fitted_pieces_are_accepted_if_the_others_can_make_up_for_their_count(monkeypatch, wanted, kept):
+@pytest.mark.parametrize("wanted, accepted", [(1.0, True), (1.2, False)])
+def test_fitted_pieces_are_accepted_if_the_others_can_make_up_for_their_count(monkeypatch, wanted, accepted):
     """Two balls with good quads are both accepted, or neither if there are a sixth too few; neither is fitted again."""
     meshes = [sphere(24, 0.3, (x, 0, 0)) for x in (-0.4, 0.4)]
     made = components.concatenate_meshes(
@@ -91,12 +91,12 @@ def test_fitted_pieces_are_accepted_if_the_others_can_make_up_for_their_count(mo
     whole = candidate.Candidate(search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0), len(quads_out), None, made)
     whole.fitted = FittedQuads(made, Constraints.none(len(made.vertices)))
     monkeypatch.setattr(components, "snap_to_features", None)
-    kept_quads, good = components.accept_good_pieces(patch, whole)
-    assert good.all() == good.any() == kept
-    assert (kept_quads is None) != kept
-    if kept:
-        assert len(kept_quads.mesh.faces) == len(quads_out)
-        assert kept_quads.method == "instant-meshes"
+    accepted_quads, good = components.accept_good_pieces(patch, whole)
+    assert good.all() == good.any() == accepted
+    assert (accepted_quads is None) != accepted
+    if accepted:
+        assert len(accepted_quads.mesh.faces) == len(quads_out)
+        assert accepted_quads.method == "instant-meshes"
 
 
 def test_small_piece_is_not_lost():

@@ -25,13 +25,13 @@ def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tu
     while len(ring) < 4:
         before = ring[-1][(ring[-1].index(at) - 1) % 4]
         ring.append(next(f for f in faces.tolist() if at in f and f[(f.index(at) + 1) % 4] == before))
-    one, two = (quad[(quad.index(at) + 1) % 4] for quad in (ring[0], ring[2]))
+    first_end, second_end = (quad[(quad.index(at) + 1) % 4] for quad in (ring[0], ring[2]))
     out = faces.copy()
     for quad in ring[:2]:
-        own = (faces == quad).all(1)
-        out[own] = np.where(faces[own] == at, len(vertices), faces[own])
+        is_quad = (faces == quad).all(1)
+        out[is_quad] = np.where(faces[is_quad] == at, len(vertices), faces[is_quad])
     side = vertices[ring[1][(ring[1].index(at) + 1) % 4]] - vertices[at]
-    new = [at, two, len(vertices), one]
+    new = [at, second_end, len(vertices), first_end]
     if not topology.is_watertight(np.concatenate([out, [new]])):
         new = new[::-1]
     return np.concatenate([vertices, (vertices[at] - apart * side)[None]]), np.concatenate([out, [new]]), new

@@ -18,12 +18,12 @@ def rotated(quads: np.ndarray, p: int, q: int) -> np.ndarray:
 
     It then ends at the corner before p in the first face.
     """
-    one = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
-    two = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
-    r, s = (one[(one.index(q) + i) % 4] for i in (1, 2))
-    t, u = (two[(two.index(p) + i) % 4] for i in (1, 2))
-    left = [f for f in quads.tolist() if f not in (one, two)]
-    return np.array([*left, [s, p, t, u], [u, q, r, s]])
+    first = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
+    second = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
+    r, s = (first[(first.index(q) + i) % 4] for i in (1, 2))
+    t, u = (second[(second.index(p) + i) % 4] for i in (1, 2))
+    others = [f for f in quads.tolist() if f not in (first, second)]
+    return np.array([*others, [s, p, t, u], [u, q, r, s]])
 
 
 def sheared(quads: np.ndarray, columns: list[tuple[int, int]]) -> np.ndarray:
@@ -98,8 +98,8 @@ def test_edges_at_creases_are_not_rotated():
         if valence.min() > 2 and topology.is_manifold(turned):
             torn = turned
     quads_out = cancel_pairs(QuadMesh(points, torn))
-    kept = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
-    assert crease <= kept
+    edges_out = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
+    assert crease <= edges_out
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
     assert irregular(points, quads_out) < irregular(points, torn) / 2

@@ -11,15 +11,15 @@ from gdtool.remesh.task import Record, Request
 @pytest.fixture
 def counted(monkeypatch):
     """Replace remesh() by one that records the requested counts; the distance of its quads is 2 / count."""
-    asked = []
+    counts = []
 
     def remesh(mesh, request):
-        asked.append(request.quads)
+        counts.append(request.quads)
         return QuadMesh(mesh.vertices, np.zeros((request.quads, 4), np.int64)), Record()
 
     monkeypatch.setattr(face_budget, "remesh", remesh)
     monkeypatch.setattr(face_budget, "deviation", lambda mesh, made: 2 / (len(made.faces) / 2))
-    return asked
+    return counts
 
 
 def test_fewest_quads_within_a_distance_are_found_in_a_few_runs(counted):

@@ -49,11 +49,11 @@ def test_corners_in_a_row_are_not_all_contracted_into_one():
     segments = np.concatenate(
         [np.stack([root[:-1], root[1:]], -1)] + [np.stack([root + y, root + y + 1], -1) for y in range(length - 1)]
     )
-    found = _clean_arcs(points, segments, short)
-    ends = found.points[found.segments]
+    features = _clean_arcs(points, segments, short)
+    ends = features.points[features.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
     # No tooth is lost, and the corners that are left stand on the spine.
-    assert (found.points[:, 1] == length - 1).sum() == teeth
+    assert (features.points[:, 1] == length - 1).sum() == teeth
     assert 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
 
 
@@ -66,12 +66,12 @@ def plate(thickness: float) -> tuple[np.ndarray, np.ndarray]:
 def test_both_rims_of_a_thin_plate_are_kept(thickness):
     """Contracting the plate's short edges would bend its rims by as much."""
     vertices, faces = plate(thickness)
-    found = find_features(TriMesh(vertices, faces), 30.0, 0.03)
-    length = np.linalg.norm(found.points[found.segments[:, 0]] - found.points[found.segments[:, 1]], axis=1)
-    assert len(found.corners) == 8
+    features = find_features(TriMesh(vertices, faces), 30.0, 0.03)
+    length = np.linalg.norm(features.points[features.segments[:, 0]] - features.points[features.segments[:, 1]], axis=1)
+    assert len(features.corners) == 8
     assert length.sum() == pytest.approx(8 + 4 * thickness)
-    assert found.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
-    assert found.share_in_strips(thickness / 2) == 0
+    assert features.share_in_strips(2 * thickness) == pytest.approx(8 / (8 + 4 * thickness))
+    assert features.share_in_strips(thickness / 2) == 0
 
 
 def test_a_curve_is_traced_even_if_another_corner_takes_its_vertex():
@@ -83,9 +83,9 @@ def test_a_curve_is_traced_even_if_another_corner_takes_its_vertex():
     faces = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], -1).reshape(-1, 4)
     points = np.array([(3.0, 10.1, 0), (17.0, 10.0, 0), (3.0, 10.3, 0), (17.0, 11.0, 0)])
     features = Features(points, np.array([(0, 1), (2, 3)]), np.array([0, 1]), np.arange(4))
-    _, held = trace_features(QuadMesh(vertices, faces), features, 1.0)
+    _, constraints = trace_features(QuadMesh(vertices, faces), features, 1.0)
     for curve in (0, 1):
-        path = vertices[held.path[held.path_curve == curve]].reshape(-1, 3)
+        path = vertices[constraints.path[constraints.path_curve == curve]].reshape(-1, 3)
         assert len(path)
         assert path[:, 0].min() <= 4
         assert path[:, 0].max() == 17

@@ -25,14 +25,14 @@ def test_a_path_around_a_corner_crosses_its_quad():
     before = Constraints(curve, np.zeros(len(vertices), bool), path, np.full(3, 3))
     # Of the two corners in the staircase one is let off here; the other stays.
     after = Constraints(np.where(np.arange(len(vertices)) == 6, -1, curve), before.fixed, path[2:], np.full(1, 3))
-    face_idx, found = quads_crossed_by_features(faces, before, after)
+    face_idx, crossing_curve = quads_crossed_by_features(faces, before, after)
     assert len(face_idx) == 1
     assert set(faces[face_idx[0]]) == {5, 6, 10, 11}
-    assert found.tolist() == [3]
+    assert crossing_curve.tolist() == [3]
     made, halved = subdivide(QuadMesh(vertices, faces), after)
     new_vertices = made.vertices
-    held = hold_centres(halved, len(new_vertices) - len(faces), face_idx, found)
-    added = np.flatnonzero(held.curve != halved.curve)
+    constraints = hold_centres(halved, len(new_vertices) - len(faces), face_idx, crossing_curve)
+    added = np.flatnonzero(constraints.curve != halved.curve)
     assert np.allclose(new_vertices[added], [[0.5, 1.5, 0]])
     released = release_straight_corners(QuadMesh(vertices, faces), before)
     assert (released.curve[[6, 11]] < 0).all()

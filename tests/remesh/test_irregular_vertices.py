@@ -11,10 +11,10 @@ from tests.geometry.solids import quad_torus
 
 def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, np.ndarray]:
     """Split vertex v of four quads into two of three edges, with a new quad between: a diagonal collapse inverted."""
-    mine = np.flatnonzero((quads == v).any(1))
-    after = {int(q[(q.tolist().index(v) + 1) % 4]): i for i, q in zip(mine, quads[mine], strict=True)}
-    before = {i: int(q[(q.tolist().index(v) - 1) % 4]) for i, q in zip(mine, quads[mine], strict=True)}
-    fan = [int(mine[0])]
+    around = np.flatnonzero((quads == v).any(1))
+    after = {int(q[(q.tolist().index(v) + 1) % 4]): i for i, q in zip(around, quads[around], strict=True)}
+    before = {i: int(q[(q.tolist().index(v) - 1) % 4]) for i, q in zip(around, quads[around], strict=True)}
+    fan = [int(around[0])]
     while len(fan) < 4:
         fan.append(after[before[fan[-1]]])
     quads = quads.copy()

@@ -35,7 +35,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
     vertices, faces = joined((small[0] * 0.1 + 3, small[1]), large)
     tried = []
 
-    def losing(mesh, target, **how):
+    def losing(mesh, target, **options):
         tried.append(target)
         keeps = target > 1000
         options = simplify.SimplifyOptions(measure_error=False)
@@ -44,12 +44,12 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
         return made._replace(mesh=both) if keeps else made
 
     monkeypatch.setattr(fallback, "simplify", losing)
-    asked = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
-    made = fallback.quads_from_input(TriMesh(vertices, faces), asked, 60.0)
+    requested = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
+    made = fallback.quads_from_input(TriMesh(vertices, faces), requested, 60.0)
     quads_out = made.faces
     assert tried[:3] == [800, 919, 1040]
     assert topology.components(quads_out)[0] == 2
-    assert asked < len(quads_out) < 1.5 * asked < 1.8 * len(faces)
+    assert requested < len(quads_out) < 1.5 * requested < 1.8 * len(faces)
 
 
 def test_isotropic_remeshing_stops_when_the_count_improves_no_more(monkeypatch):
@@ -79,14 +79,14 @@ def test_isotropic_remeshing_stops_when_the_count_improves_no_more(monkeypatch):
 )
 def test_isotropic_remeshing_is_skipped_for_too_few_triangles(monkeypatch, mesh, quads, few):
     """At least twelve triangles are needed for a piece, and eighty for a handle."""
-    sought = []
-    monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *given: sought.append(given))
+    calls = []
+    monkeypatch.setattr(smoothed, "quads_from_isotropic", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(smoothed, "split_count", lambda faces, quads: quads)
     patch = RemeshPatch(TriMesh(*mesh), quads, 0.1, Request(quads=quads), lambda: ProjectionTarget(TriMesh(*mesh)))
     made = smoothed.split(patch)
     faces = made.faces
     assert fallback.too_few_for_isotropic(mesh[1], quads) == few
-    assert len(sought) == (not few)
+    assert len(calls) == (not few)
     assert topology.is_watertight(faces)
 
 
@@ -134,7 +134,7 @@ def test_quads_without_area_are_smoothed_while_their_neighbours_stay(monkeypatch
     a, b, c, d = quad_faces[100]
     split[b], split[d] = split[a], split[c]
     assert polygon_normals(QuadMesh(split, quad_faces))[1][100] < 1e-12
-    monkeypatch.setattr(shaping, "_abandoning_faces", lambda *given: np.arange(len(quad_faces)))
+    monkeypatch.setattr(shaping, "_abandoning_faces", lambda *arguments: np.arange(len(quad_faces)))
     surface, request = ProjectionTarget(TriMesh(vertices, faces)), Request(quads=600)
     out = shaping.keep_better_vertices(
         QuadMesh(split, quad_faces),
@@ -146,5 +146,5 @@ def test_quads_without_area_are_smoothed_while_their_neighbours_stay(monkeypatch
     edge = (polygon_normals(QuadMesh(out, quad_faces))[1].sum() / len(quad_faces)) ** 0.5
     assert polygon_normals(QuadMesh(out, quad_faces))[1].min() > 1e-4 * edge**2
     touched = np.isin(quad_faces, quad_faces[100]).any(1)
-    kept = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
-    assert np.array_equal(out[kept], split[kept])
+    unmoved = np.setdiff1d(quad_faces[~touched], quad_faces[touched])
+    assert np.array_equal(out[unmoved], split[unmoved])

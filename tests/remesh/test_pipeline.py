@@ -32,17 +32,17 @@ def test_large_pieces_are_not_decimated_further_because_of_small_ones():
 
 def test_a_bad_quick_collapse_is_repeated_with_the_topology_kept(monkeypatch):
     vertices, faces = sphere(120, 0.5)
-    begun, begin = [], simplify.begin
+    collapses, begin = [], simplify.begin
 
-    def shrinking(function, mesh, call, *given, **limits):
-        begun.append(call.function)
+    def shrinking(function, mesh, call, *arguments, **limits):
+        collapses.append(call.function)
         smaller = TriMesh(mesh.vertices * (0.5 if call.function is simplify.collapse else 1), mesh.faces)
-        return begin(function, smaller, call, *given, **limits)
+        return begin(function, smaller, call, *arguments, **limits)
 
     monkeypatch.setattr(simplify, "begin", shrinking)
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=2000))
     out = made.vertices
-    assert begun == [simplify.collapse, simplify.collapse_keeping_topology]
+    assert collapses == [simplify.collapse, simplify.collapse_keeping_topology]
     assert abs(np.linalg.norm(out, axis=1) - 0.5).max() < 0.01
     assert any(line.startswith("simplify: strays") for line in record.failed)
     assert record.figures["simplify_error"] < 0.01
@@ -69,8 +69,8 @@ def test_torus_keeps_its_hole():
     assert volume(out, quads_out) == pytest.approx(2 * np.pi**2 * 0.65 * 0.28**2 / 8, rel=0.02)
 
 
-@pytest.mark.parametrize("each, ways", [(70, {"engines"}), (220, {"instant-meshes, 1 subdivision"})])
-def test_a_lattice_keeps_all_handles_where_engines_would_lose_some(each, ways):
+@pytest.mark.parametrize("each, attempts", [(70, {"engines"}), (220, {"instant-meshes, 1 subdivision"})])
+def test_a_lattice_keeps_all_handles_where_engines_would_lose_some(each, attempts):
     """With few quads for each handle, attempts that would lose handles are skipped: all, or those that subdivide."""
     vertices, faces = lattice()
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=28 * each))
@@ -78,14 +78,14 @@ def test_a_lattice_keeps_all_handles_where_engines_would_lose_some(each, ways):
     assert whole(quads_out)
     assert topology.handles(quads_out, 1) == 28
     assert abs(len(quads_out) / (28 * each) - 1) <= 0.03
-    assert ways == {line.split(":")[0] for line in record.failed if "not tried" in line and "28 handles" in line}
+    assert attempts == {line.split(":")[0] for line in record.failed if "not tried" in line and "28 handles" in line}
     assert record.engine == "pair and split" or each > 100
     assert shape_figures(QuadMesh(out, quads_out))["jacobian_mean"] > 0.75
     assert shape_figures(QuadMesh(out, quads_out))["folded_share"] < 1e-3
 
 
 def test_a_requested_engine_is_tried_whatever_the_handles(monkeypatch):
-    tried = in_this_process(monkeypatch, lambda *given: ENGINES["instant-meshes"](*given))
+    tried = in_this_process(monkeypatch, lambda *arguments: ENGINES["instant-meshes"](*arguments))
     pipeline.remesh(TriMesh(*lattice()), Request(quads=1000, engine="instant-meshes"))
     assert tried
 
@@ -127,6 +127,6 @@ def test_open_plane_stays_open_and_flat():
 
 def test_equal_input_gives_equal_quads():
     vertices, faces = sphere(24)
-    one, two = (pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=500)) for _ in range(2))
-    assert (one[0].vertices == two[0].vertices).all()
-    assert (one[0].faces == two[0].faces).all()
+    first, second = (pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=500)) for _ in range(2))
+    assert (first[0].vertices == second[0].vertices).all()
+    assert (first[0].faces == second[0].faces).all()

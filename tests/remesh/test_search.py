@@ -88,7 +88,7 @@ def test_a_much_nearer_candidate_goes_before_a_doubtful_one(tops, wanted, order)
         )
         for height in tops
     ]
-    assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
+    assert [id(candidate) for candidate in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
         id(pair[k]) for k in order
     ]
 
@@ -103,7 +103,7 @@ def test_quads_that_leave_out_surface_are_rejected_before_fitting(monkeypatch):
     out, quads_out = made.vertices, made.faces
     patch = RemeshPatch(TriMesh(vertices, faces), 1000, 0.045, Request(), None)
     height = out[quads_out].mean(1)[:, 2]
-    left = [
+    reasons = [
         Candidate(
             search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
             1000,
@@ -112,8 +112,8 @@ def test_quads_that_leave_out_surface_are_rejected_before_fitting(monkeypatch):
         ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
-    assert left[:2] == [None, None]
-    assert "leaves out 3" in left[2]
+    assert reasons[:2] == [None, None]
+    assert "leaves out 3" in reasons[2]
     calls = in_this_process(monkeypatch, lambda *_: topology.compact(QuadMesh(out, quads_out[height < 0.0])))
     monkeypatch.setattr(candidates, "repair_and_judge", lambda mesh, *_: candidates.JudgedQuads(None, mesh))
     monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
@@ -222,17 +222,17 @@ def test_candidates_are_sorted_in_space(monkeypatch):
     monkeypatch.setitem(
         candidates.ENGINES, "quadriflow", lambda *_: QuadMesh(vertices[mixed], rng.permutation(number[faces]))
     )
-    one = candidates.make_candidate(
+    candidate = candidates.make_candidate(
         TriMesh(vertices, triangulated(faces)[0]), candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
-    assert one.fault is None
-    assert len(one.mesh.faces) == len(faces)
+    assert candidate.fault is None
+    assert len(candidate.mesh.faces) == len(faces)
 
     def places(v, q):
         return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
 
-    assert places(one.mesh.vertices, one.mesh.faces) == places(vertices, faces)
-    ends = topology.edges_of(one.mesh.faces).ends
+    assert places(candidate.mesh.vertices, candidate.mesh.faces) == places(vertices, faces)
+    ends = topology.edges_of(candidate.mesh.faces).ends
     # A third of them, on average, where it is by chance.
     assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
@@ -259,9 +259,9 @@ def test_quads_that_cut_off_edges_are_rejected():
 def test_uncovered_surface_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
-    rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
+    open_faces = np.array([f for f in faces.tolist() if f not in lid.tolist()])
     surface = ProjectionTarget(TriMesh(vertices, faces))
-    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
+    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, open_faces))
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, closed)), surface, (0.1,)) == [0]
     # The lid but its rim.
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, opened)), surface, (0.1, 2.0)) == pytest.approx(
@@ -287,7 +287,7 @@ def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(
     monkeypatch.setattr(
         candidates,
         "rejection_reason",
-        lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
+        lambda *arguments: ("cuts off 0.7% of the surface" if arguments[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
@@ -303,7 +303,7 @@ def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(
     monkeypatch.undo()
     in_this_process(monkeypatch)
     monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(candidates, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
+    monkeypatch.setattr(candidates, "rejection_reason", lambda *arguments: ("cuts off 2% of the surface", 0.5))
     assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
 
 
@@ -347,7 +347,7 @@ def test_the_first_good_candidate_is_taken(monkeypatch):
     The other goes first if the first is not promising. If none is good, the nearest to the surface is taken.
     """
     attempt = search._attempts(20000, Request())[0]
-    drawn = []
+    fitted = []
 
     def candidate(far, least, wrong=None, outline=0.5):
         quads_out = Candidate(
@@ -362,29 +362,29 @@ def test_the_first_good_candidate_is_taken(monkeypatch):
         quads_out.asked_of_outline = outline
         return quads_out
 
-    def snap_to_features(one, patch):
-        one.snapped = one.asked_of_outline
-        return one.snapped < 1
+    def snap_to_features(taken, patch):
+        taken.snapped = taken.asked_of_outline
+        return taken.snapped < 1
 
     monkeypatch.setattr(Candidate, "is_promising", snap_to_features)
-    monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
+    monkeypatch.setattr(Candidate, "fit", lambda taken, patch: fitted.append(taken))
     choose = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 1000, 0.1, Request(), None), Record())._fit_first_good
-    good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
+    good, better, far, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
     assert choose([good, better]) is good
-    assert drawn == [good]
-    assert choose([bare, good]) is good
+    assert fitted == [good]
+    assert choose([far, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
-    assert choose([bare, thin]) is bare
+    assert choose([far, thin]) is far
     assert choose([candidate(2.0, 0.5), thin]) is thin
-    drawn.clear()
+    fitted.clear()
     late = candidate(0.9, 0.3, outline=1.1)
     assert choose([late, good]) is good
-    assert drawn == [good]
+    assert fitted == [good]
     late.snapped = None
-    drawn.clear()
+    fitted.clear()
     assert choose([late, candidate(2.0, 0.5)]) is late
-    assert drawn[1] is late
-    assert len(drawn) == 2
+    assert fitted[1] is late
+    assert len(fitted) == 2
 
 
 def test_the_count_includes_tips_before_fitting(monkeypatch):
@@ -408,7 +408,7 @@ def test_the_count_includes_tips_before_fitting(monkeypatch):
         )
         return quads_out
 
-    monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
+    monkeypatch.setattr(Candidate, "snap", lambda taken, patch: setattr(taken, "snapped", taken.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
     assert next(search_run._with_right_count([plain, far], 0)) is plain
     assert far.snapped is None
@@ -436,18 +436,18 @@ def test_subdivision_is_not_tried_where_creases_are_closer_than_a_quad(monkeypat
     ) == [0.0]
 
 
-@pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
-def test_an_engine_has_its_own_memory_limit_within_the_requests(monkeypatch, given, least, most):
+@pytest.mark.parametrize("memory_mb, least, most", [(16000, 2000, 2500), (500, 500, 500)])
+def test_an_engine_has_its_own_memory_limit_within_the_requests(monkeypatch, memory_mb, least, most):
     """The limit follows the number of quads and triangles, because Instant Meshes fills some holes for ever."""
     limits = []
 
-    def begin(*_, memory_mb, **more):
+    def begin(*_, memory_mb, **options):
         limits.append(memory_mb)
         return Ended(ChildFailed("ran out"))
 
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
-    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, memory_mb=given))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, memory_mb=memory_mb))
     quads_out = made.faces
     assert limits
     assert all(least <= limit <= most for limit in limits)

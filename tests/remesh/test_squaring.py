@@ -43,12 +43,14 @@ def test_the_middle_of_three_corners_in_a_line_is_released_from_its_curve():
     curve[[39, 40, 49]] = 0
     fixed = np.zeros(len(vertices), bool)
     fixed[[38, 50]] = True
-    found = release_straight_corners(QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64)))
-    assert found.curve[40] == -1
-    assert found.curve[49] == -1
-    assert found.curve[39] == 0
-    assert found.path.tolist() == [[38, 39]]
-    assert found.fixed[[38, 50]].all()
+    released = release_straight_corners(
+        QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64))
+    )
+    assert released.curve[40] == -1
+    assert released.curve[49] == -1
+    assert released.curve[39] == 0
+    assert released.path.tolist() == [[38, 39]]
+    assert released.fixed[[38, 50]].all()
     fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
     assert (
         len(
@@ -67,9 +69,11 @@ def test_a_corner_pinned_in_the_wrong_place_is_released():
     fixed = np.zeros(len(vertices), bool)
     fixed[40] = True
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-    out, left = release_and_smooth(QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned)
+    out, constraints = release_and_smooth(
+        QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned
+    )
     assert scaled_jacobian(QuadMesh(out, quads)).min() >= 0.2
-    assert not left.fixed[40]
+    assert not constraints.fixed[40]
 
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
@@ -79,25 +83,28 @@ def test_a_tip_beside_folded_quads_stays_where_smoothing_would_shrink_it(height,
     tip = 40
     vertices[tip, 2] = height
     triangles = triangulated(quads)[0]
-    surface, held = ProjectionTarget(TriMesh(vertices, triangles.astype(np.int64))), Constraints.none(len(vertices))
-    held.fixed[tip] = True
+    surface, constraints = (
+        ProjectionTarget(TriMesh(vertices, triangles.astype(np.int64))),
+        Constraints.none(len(vertices)),
+    )
+    constraints.fixed[tip] = True
     bent = vertices.copy()
     bent[moved] += by
     bent = surface.closest(bent)[2]
     assert scaled_jacobian(QuadMesh(bent, quads)).min() < 0
 
-    def bare(out):
+    def uncovered_edges(out):
         return closest_points(vertices[[tip]], TriMesh(out, triangles))[0][0] * 8  # edges are 1/8 long
 
-    out, left = release_and_smooth(QuadMesh(bent, quads), surface, NO_FEATURES, held)
+    out, remaining = release_and_smooth(QuadMesh(bent, quads), surface, NO_FEATURES, constraints)
     assert scaled_jacobian(QuadMesh(out, quads)).min() > 0.5
-    assert bare(out) < 1e-9
-    assert left.fixed[tip]
-    out, left = release_and_smooth(
-        QuadMesh(bent, quads), surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
+    assert uncovered_edges(out) < 1e-9
+    assert remaining.fixed[tip]
+    out, remaining = release_and_smooth(
+        QuadMesh(bent, quads), surface, NO_FEATURES, constraints, options=ReleaseOptions(max_uncovered_edges=2.0)
     )
-    assert 0.75 < bare(out) < 2
-    assert not left.fixed[tip]
+    assert 0.75 < uncovered_edges(out) < 2
+    assert not remaining.fixed[tip]
 
 
 def test_releasing_folds_no_further_quads():

@@ -104,16 +104,16 @@ def test_uncovered_surface_is_measured_by_area_and_not_by_vertices():
 
 def _cut_in_four(vertices, faces, which, rounds):
     """Cut some faces, which (f,) bool, in four at the middles of their edges, but not the faces beside them."""
-    own, rest = faces[which], faces[~which]
+    cut, others = faces[which], faces[~which]
     for _ in range(rounds):
-        a, b, c = (vertices[own[:, i]] for i in range(3))
-        n, k = len(vertices), np.arange(len(own))
-        ab, bc, ca = n + k, n + len(own) + k, n + 2 * len(own) + k
+        a, b, c = (vertices[cut[:, i]] for i in range(3))
+        n, k = len(vertices), np.arange(len(cut))
+        ab, bc, ca = n + k, n + len(cut) + k, n + 2 * len(cut) + k
         vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-        own = np.concatenate(
-            [np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))]
+        cut = np.concatenate(
+            [np.stack(x, -1) for x in ((cut[:, 0], ab, ca), (ab, cut[:, 1], bc), (ca, bc, cut[:, 2]), (ab, bc, ca))]
         )
-    return vertices, np.concatenate([own, rest])
+    return vertices, np.concatenate([cut, others])
 
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
@@ -139,9 +139,9 @@ def test_paths_along_creases_end_where_a_tip_is_extruded():
     path = np.stack([around, np.roll(around, -1)], -1)
     curve = np.full(len(vertices), -1)
     curve[around] = 0
-    held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
+    path_constraints = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
     made, constraints, tips, _, _ = extrude_tips(
-        QuadMesh(vertices, faces), held, ProjectionTarget(TriMesh(*horned(0.2))), edge
+        QuadMesh(vertices, faces), path_constraints, ProjectionTarget(TriMesh(*horned(0.2))), edge
     )
     quads_out = made.faces
     edges = set(map(tuple, topology.edges_of(quads_out).ends.tolist()))
@@ -152,9 +152,9 @@ def test_paths_along_creases_end_where_a_tip_is_extruded():
 
 def test_an_engine_that_cuts_a_horn_short_is_still_accepted(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
-    asked = Request(quads=2000)
+    request = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
-    made, record = pipeline.remesh(TriMesh(vertices, faces), asked)
+    made, record = pipeline.remesh(TriMesh(vertices, faces), request)
     out, quads_out = made.vertices, made.faces
     figures = distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 20000)
     assert "instant-meshes" in record.engine
@@ -166,7 +166,7 @@ def test_an_engine_that_cuts_a_horn_short_is_still_accepted(monkeypatch):
     monkeypatch.setattr(
         shaping, "extrude_tips", lambda mesh, constraints, *_: ExtrudedQuads(mesh, constraints, None, 0.0, np.zeros(1))
     )
-    assert pipeline.remesh(TriMesh(vertices, faces), asked)[1].engine == "pair and split"
+    assert pipeline.remesh(TriMesh(vertices, faces), request)[1].engine == "pair and split"
 
 
 def test_fixed_vertices_on_a_blunt_tip_leave_room_for_quads():

@@ -49,13 +49,13 @@ def test_fixed_vertices_move_in_the_last_rounds_only():
     vertices, faces, pulled = folded(6)
     fixed = np.zeros(len(vertices), bool)
     fixed[pulled] = True
-    held = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
+    constraints = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
     surface, features = ProjectionTarget(TriMesh(*plane())), find_features(TriMesh(*plane()), 181.0, 1.0)
-    kept = untangle(
-        QuadMesh(vertices, faces), surface, features, held, max_visits=10
+    early = untangle(
+        QuadMesh(vertices, faces), surface, features, constraints, max_visits=10
     )  # no visit is left for the last rounds
-    assert np.array_equal(kept[pulled], vertices[pulled])
-    out = untangle(QuadMesh(vertices, faces), surface, features, held)
+    assert np.array_equal(early[pulled], vertices[pulled])
+    out = untangle(QuadMesh(vertices, faces), surface, features, constraints)
     assert scaled_jacobian(QuadMesh(out, faces)).min() > scaled_jacobian(QuadMesh(vertices, faces)).min()
 
 
@@ -67,8 +67,8 @@ def test_vertices_on_a_crease_slide_along_it():
     on = on[np.argsort(vertices[on, 0])]
     middles = features.points[features.segments].mean(1)
     curve = features.curve[np.abs(middles - vertices[on].mean(0)).sum(1).argmin()]
-    held = np.full(len(vertices), -1)
-    held[on[1:-1]] = curve
+    curve_of_vertex = np.full(len(vertices), -1)
+    curve_of_vertex[on[1:-1]] = curve
     moved = vertices.copy()
     moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next one
     assert scaled_jacobian(QuadMesh(moved, faces)).min() <= 0
@@ -76,7 +76,7 @@ def test_vertices_on_a_crease_slide_along_it():
         QuadMesh(moved, faces),
         surface,
         features,
-        Constraints(held, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)),
+        Constraints(curve_of_vertex, np.zeros(len(vertices), bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64)),
     )
     assert scaled_jacobian(QuadMesh(out, faces)).min() > 0.2
     assert np.abs(out[on, 1:] - vertices[on, 1:]).max() < 1e-9
@@ -95,15 +95,15 @@ def test_vertices_of_a_batch_move_as_each_would_alone(monkeypatch):
     """A batch mixes vertices with different numbers of faces and neighbours: beside the rim, in corners and within."""
     vertices, faces, _ = folded(9)
     vertices[[12, 38, 56], 1] += 0.2
-    how = (
+    surface_and_constraints = (
         ProjectionTarget(TriMesh(*plane())),
         find_features(TriMesh(*plane()), 181.0, 1.0),
         Constraints.none(len(vertices)),
     )
-    together, whole = untangle(QuadMesh(vertices, faces), *how), _independent_batches
+    together, batches_of = untangle(QuadMesh(vertices, faces), *surface_and_constraints), _independent_batches
     monkeypatch.setattr(
         "gdtool.remesh.fit.untangle._independent_batches",
-        lambda *given: [batch[k : k + 1] for batch in whole(*given) for k in range(len(batch))],
+        lambda *arguments: [batch[k : k + 1] for batch in batches_of(*arguments) for k in range(len(batch))],
     )
-    np.testing.assert_array_equal(untangle(QuadMesh(vertices, faces), *how), together)
+    np.testing.assert_array_equal(untangle(QuadMesh(vertices, faces), *surface_and_constraints), together)
     assert (together != vertices).any(1).sum() > 10

@@ -108,14 +108,16 @@ def test_orders_are_not_searched_where_charts_cannot_be_separated(monkeypatch):
     sides = np.random.default_rng(3).uniform(1, 5, (14, 2))
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     charts = [(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side, triangles) for side in sides]
-    sought, improved = [], search._improve_layouts
+    calls, improved = [], search._improve_layouts
     monkeypatch.setattr(
-        search, "_improve_layouts", lambda *given, **more: sought.append(given) or improved(*given, **more)
+        search,
+        "_improve_layouts",
+        lambda *arguments, **options: calls.append(arguments) or improved(*arguments, **options),
     )
-    monkeypatch.setattr(FineGridCompactor, "separate", lambda *given: None)
+    monkeypatch.setattr(FineGridCompactor, "separate", lambda *arguments: None)
     places, _ = search.pack(charts, 0.002)
-    shares = [given[0].shapes for given in sought]
-    assert len(sought) == 2
+    shares = [arguments[0].shapes for arguments in calls]
+    assert len(calls) == 2
     assert shares[0] != shares[1]
     assert (
         owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1

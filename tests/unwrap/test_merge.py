@@ -55,11 +55,11 @@ def test_charts_that_would_close_or_stretch_stay_apart():
 
 
 def test_the_sides_of_a_thin_wall_keep_their_labels():
-    (one, up), (two, down) = sheet(30), sheet(30, height=0.002, down=True)
-    vertices, faces = np.concatenate([one, two]), np.concatenate([up, down + len(one)])
+    (front, up), (back, down) = sheet(30), sheet(30, height=0.002, down=True)
+    vertices, faces = np.concatenate([front, back]), np.concatenate([up, down + len(front)])
     label = np.repeat([0, 1], 900)
-    (one, up), (two, down) = sheet(7), sheet(7, height=0.002, down=True)
-    proxy = proxy_of(np.concatenate([one, two]), np.concatenate([up, down + len(one)]))
+    (front, up), (back, down) = sheet(7), sheet(7, height=0.002, down=True)
+    proxy = proxy_of(np.concatenate([front, back]), np.concatenate([up, down + len(front)]))
     corners = np.concatenate([proxy.faces, np.full((len(proxy.faces), 1), -1)], 1)
     adjacency = Adjacency(QuadMesh(proxy.vertices, corners))
     labels = _transfer_labels(QuadMesh(vertices, faces), label, proxy, adjacency)
@@ -73,7 +73,7 @@ def test_charts_that_are_flat_together_only_on_the_proxy_are_split_again(monkeyp
     ball.remove_unreferenced_vertices()
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     label = (ball.triangles_center[:, 2] > 0.985).astype(int)
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: np.zeros(len(faces), int))
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: np.zeros(len(faces), int))
     monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
     charts, _ = schedule.flatten_all(
         QuadMesh(ball.vertices, faces), label, schedule.FlattenLimits(GOOD, 1.5), TriMesh(ball.vertices, ball.faces)
@@ -90,8 +90,8 @@ def test_a_vertex_in_which_a_chart_touches_itself_is_doubled():
     from gdtool.unwrap.segment.charts import chart_mesh
 
     vertices, faces = sheet(2)
-    for own, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
-        made = chart_mesh(QuadMesh(vertices, faces[own]))
+    for faces_idx, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
+        made = chart_mesh(QuadMesh(vertices, faces[faces_idx]))
         points, corners = made.vertices, made.faces
         assert len(points) == count
-        np.testing.assert_array_equal(points[corners], vertices[faces[own]])
+        np.testing.assert_array_equal(points[corners], vertices[faces[faces_idx]])

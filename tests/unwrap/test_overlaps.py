@@ -99,8 +99,8 @@ def test_a_piece_is_added_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
             TriMesh(vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
         )[0][0]
 
-    def left(home, beside=(dome, flat), good=GOOD):
-        charts = [chart(own)._replace(faces_idx=own) for own in beside]
+    def unplaced(home, beside=(dome, flat), good=GOOD):
+        charts = [chart(faces_of_chart)._replace(faces_idx=faces_of_chart) for faces_of_chart in beside]
         return len(
             give_to_neighbours(
                 Adjacency(QuadMesh(vertices, faces)),
@@ -111,29 +111,29 @@ def test_a_piece_is_added_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
             )
         ), charts
 
-    count, charts = left(piece)
+    count, charts = unplaced(piece)
     assert not count
     assert len(charts[0][0]) == len(dome)
     assert sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
     # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
     # tried.
-    assert left(flat, [flat])[0] == 1
-    assert left(dome, [flat])[0] == 0
-    assert left(piece, [dome], 1 + 1e-9)[0] == 1
+    assert unplaced(flat, [flat])[0] == 1
+    assert unplaced(dome, [flat])[0] == 0
+    assert unplaced(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.unwrap.segment.overlaps._MAX_WORK", -1)
-    assert left(piece)[0] == 1
+    assert unplaced(piece)[0] == 1
 
 
 @pytest.mark.parametrize(("columns", "stays"), [(1, True), (4, False)])
 def test_a_chart_much_larger_than_a_piece_keeps_its_coordinates(columns, stays):
     vertices, faces = sheet(12, bend=1.0)
     column = np.arange(144) % 12
-    piece, own = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
-    made = chart_mesh(QuadMesh(vertices, faces[own]))
+    piece, others = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
+    made = chart_mesh(QuadMesh(vertices, faces[others]))
     points, corners = made.vertices, made.faces
     # Bent and slanted: laid anew it would not come to lie so.
-    lies = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
-    charts = [Chart(own, corners, lies, triangulated(corners)[0])]
+    flat_uv = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
+    charts = [Chart(others, corners, flat_uv, triangulated(corners)[0])]
     assert not give_to_neighbours(
         Adjacency(QuadMesh(vertices, faces)),
         QuadMesh(vertices, faces),
@@ -144,5 +144,5 @@ def test_a_chart_much_larger_than_a_piece_keeps_its_coordinates(columns, stays):
     faces_idx, corners, uv, triangles = charts[0]
     assert sorted(faces_idx) == list(range(144))
     assert not overlapping_triangles(uv, triangles).any()
-    assert (uv[: len(lies)] == lies).all() == stays
+    assert (uv[: len(flat_uv)] == flat_uv).all() == stays
     assert stretch(TriMesh(chart_mesh(QuadMesh(vertices, faces[faces_idx])).vertices, triangles), uv) < 1.02

@@ -82,10 +82,10 @@ def test_torus_has_uniform_density_and_gaps():
 
 
 def test_two_pieces_and_triangles_mixed():
-    one, quads = box(2)
-    two, triangles = cube(0.3)
-    vertices = np.concatenate([one, two + 2])
-    faces = np.concatenate([quads, np.concatenate([triangles + len(one), np.full((12, 1), -1)], 1)])
+    large, quads = box(2)
+    small, triangles = cube(0.3)
+    vertices = np.concatenate([large, small + 2])
+    faces = np.concatenate([quads, np.concatenate([triangles + len(large), np.full((12, 1), -1)], 1)])
     checked(vertices, faces, pipeline.unwrap(QuadMesh(vertices, faces), SMALL))
 
 
@@ -163,16 +163,16 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     ell = quads[(plate[quads].mean(1)[:, :2] < 0.25).any(1)]
     meshes = [(plate, quads)] * 8 + [(plate, ell)]
     vertices = np.concatenate([points + [0, 0, height] for height, (points, _) in enumerate(meshes)])
-    faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
-    found = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
-    assert [what for what, _, _ in found.skipped] == ["cutting further for packing"]
-    assert found.skipped[0][2] > 0
+    faces = np.concatenate([quads_of_plate + 81 * k for k, (_, quads_of_plate) in enumerate(meshes)])
+    uncut = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
+    assert [what for what, _, _ in uncut.skipped] == ["cutting further for packing"]
+    assert uncut.skipped[0][2] > 0
     monkeypatch.setattr(pipeline, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "_MAX_STEP_GAIN", 1.0)
-    other = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
-    few, many = checked(vertices, faces, found), checked(vertices, faces, other)
-    assert not other.skipped
+    cut = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
+    few, many = checked(vertices, faces, uncut), checked(vertices, faces, cut)
+    assert not cut.skipped
     assert many["coverage"] < 1.1 * few["coverage"]
     assert many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
 
@@ -302,8 +302,8 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     few, parts = cut_to_pack(adjacency, [chart], [2, 40])
     assert 2 <= len(few) <= 3 < len(parts)
     assert sorted(np.concatenate([part[0] for part in parts])) == list(range(len(quads)))
-    for faces_idx, corners, own, _ in parts:
-        np.testing.assert_array_equal(own[corners], uv[quads[faces_idx]])
+    for faces_idx, corners, part_uv, _ in parts:
+        np.testing.assert_array_equal(part_uv[corners], uv[quads[faces_idx]])
     # A filled square is not cut.
     square = np.stack(np.meshgrid(np.linspace(0, 1, 11), np.linspace(0, 1, 11)), -1).reshape(-1, 2)
     i = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
@@ -320,10 +320,10 @@ def test_two_rings_fill_the_square_better_once_cut():
     vertices, quads, _ = ring_of_quads()
     both = np.concatenate([vertices, vertices + (2, 0, 0)])
     faces = np.concatenate([quads, quads + len(vertices)])
-    found = checked(both, faces, pipeline.unwrap(QuadMesh(both, faces), SMALL))
+    figures = checked(both, faces, pipeline.unwrap(QuadMesh(both, faces), SMALL))
     # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of
     # their width.
-    assert found["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
+    assert figures["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
 
 
 def test_sets_of_more_charts_are_not_tried_where_few_fill_the_square():
@@ -352,15 +352,15 @@ def test_sets_of_more_charts_are_not_tried_where_few_fill_the_square():
 def test_skipped_sets_of_charts_cost_little_coverage_and_few_seams(monkeypatch, around, across, minor):
     """Against packing every set of charts, skipping some costs at most 0.02 of the square and eight charts."""
     vertices, faces, _ = torus(around, across, 0.35, minor)
-    found = []
+    measured = []
     for gains in (search._MAX_STEP_GAIN, np.inf):
         monkeypatch.setattr(search, "_MAX_STEP_GAIN", gains)
-        laid = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=1024, padding=4))
-        leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
-        assert len(leapt) == (gains < np.inf)
-        assert not laid.failed
-        found.append(pipeline.figures(QuadMesh(vertices, faces, laid.uv, laid.face_uvs)))
-    quick, whole = found
+        result = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=1024, padding=4))
+        reasons = [why for what, why, _ in result.skipped if what.startswith("packing")]
+        assert len(reasons) == (gains < np.inf)
+        assert not result.failed
+        measured.append(pipeline.figures(QuadMesh(vertices, faces, result.uv, result.face_uvs)))
+    quick, whole = measured
     assert quick["coverage"] > whole["coverage"] - 0.02
     assert quick["charts"] <= whole["charts"] + 8
     assert quick["overlap"] == 0

@@ -18,9 +18,9 @@ def ball(level=4):
 def whole_stretch(vertices, faces, charts):
     """Compute the L2 stretch of all charts together."""
     points, corners, uvs, offset = [], [], [], 0
-    for faces_idx, own, uv, triangles in charts:
+    for faces_idx, chart_corners, uv, triangles in charts:
         place = np.zeros((len(uv), 3))
-        place[own[own >= 0]] = vertices[faces[faces_idx][own >= 0]]
+        place[chart_corners[chart_corners >= 0]] = vertices[faces[faces_idx][chart_corners >= 0]]
         points.append(place)
         corners.append(triangles + offset)
         uvs.append(uv)
@@ -32,7 +32,7 @@ def test_the_most_stretched_charts_are_cut_until_all_together_stretch_little(mon
     vertices, faces, centre = ball()
     label = (centre[:, 2] > 0).astype(int)
     proxy = TriMesh(vertices, faces[:, :3])
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: label)
     charts, why = schedule.flatten_all(QuadMesh(vertices, faces), label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert 1.002 < whole_stretch(vertices, faces, charts) < 1.014
     assert 3 <= len(charts) <= 8
@@ -59,7 +59,7 @@ def test_cutting_ends_where_stretch_cannot_be_reduced(monkeypatch):
     vertices, faces, centre = ball(3)
     crumpled = vertices * (1 + 0.5 * np.random.default_rng(0).random((len(vertices), 1)))
     label = (centre[:, 2] > 0).astype(int)
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: label)
     charts, why = schedule.flatten_all(
         QuadMesh(crumpled, faces), label, schedule.FlattenLimits(1.0000001, 1.1), TriMesh(crumpled, faces[:, :3])
     )
@@ -77,7 +77,7 @@ def test_a_chart_is_cut_between_its_parts_or_else_through_the_middle():
     vertices = vertices * [2, 1, 1]
     adjacency, column = Adjacency(QuadMesh(vertices, faces)), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
-        one, other = schedule._split_set(adjacency, part, np.arange(400))
-        assert {len(one), len(other)} == {20 * first, 400 - 20 * first}
-        assert (column[one] < first).all() != (column[other] < first).all()
+        first_set, second_set = schedule._split_set(adjacency, part, np.arange(400))
+        assert {len(first_set), len(second_set)} == {20 * first, 400 - 20 * first}
+        assert (column[first_set] < first).all() != (column[second_set] < first).all()
     assert min(map(len, schedule._split_set(adjacency, np.zeros(400, int), np.arange(400)))) > 150

@@ -17,14 +17,14 @@ def plates(*cells):
         x, y = np.meshgrid(np.arange(w + 1.0), np.arange(h + 1.0))
         row, column = np.nonzero(mask)
         corner = row * (w + 1) + column
-        own = np.stack([corner, corner + 1, corner + w + 2, corner + w + 1], -1)
+        corners = np.stack([corner, corner + 1, corner + w + 2, corner + w + 1], -1)
         uv = np.stack([x.ravel(), y.ravel()], -1)
-        used, local = np.unique(own, return_inverse=True)
+        used, local = np.unique(corners, return_inverse=True)
         local = local.reshape(-1, 4)
-        charts.append(Chart(faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
+        charts.append(Chart(faces + np.arange(len(corners)), local, uv[used], triangulated(local)[0]))
         points.append(np.concatenate([uv, np.full((len(uv), 1), float(height))], 1))
-        quads.append(own + vertices)
-        vertices, faces = vertices + len(uv), faces + len(own)
+        quads.append(corners + vertices)
+        vertices, faces = vertices + len(uv), faces + len(corners)
     return Adjacency(QuadMesh(np.concatenate(points), np.concatenate(quads))), charts
 
 
