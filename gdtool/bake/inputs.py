@@ -21,14 +21,14 @@ from gdtool.geometry.meshes import QuadMesh, TriMesh
 # A mesh file is taken to be in the normalised frame when its bounding box is centred to this distance, and its longest
 # side is 1 to this difference.
 NORMALISED_OFFSET, NORMALISED_SCALE = 0.02, 0.05
-# Texture coordinates beyond this are damaged: no one tiles so often.
+# Larger texture coordinates are taken to be damaged: textures are not repeated this often.
 MAX_UV = 64
 # The least share of doubly covered texels, of those covered, that is worth a warning.
 OVERLAP_SHARE = 0.001
 # Side in texels of the image in which overlaps are counted.
 OVERLAP_SIZE = 512
 
-# About how many triangles tell whether a source is inside out.
+# Triangles of the target, about, that are compared with the source to find whether it is inside out.
 MOST_COMPARED = 5000
 
 MATERIALS = ("albedo", "roughness", "metallic")

@@ -1,7 +1,7 @@
 """Make coarser levels of an unwrapped mesh that share its maps, by decimation that preserves UV seams.
 
-A point of a coarse level has about the same texture coordinates as the point of the full mesh that it stands for. So
-the same maps serve every level; `drift` measures how well.
+A point of a coarse level has about the same texture coordinates as the nearest point of the full mesh. So all levels
+use the same maps; `drift` measures the difference.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from gdtool.core.native import imported
 from gdtool.core.threads import mapped
 from gdtool.geometry.meshes import TriMesh
 
-# The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
+# The largest mean drift of a level, as a share of the extent: with more, a level reads the maps of other parts.
 MAX_DRIFT = 0.02
-# A level that cannot come down to what is asked is still worth having with less than this share of the one before.
+# A level with more triangles than requested is kept if it has less than this share of those of the level before.
 MAX_SHARE = 0.9
-# The most triangles of a level, as a multiple of what is asked, without a warning.
+# The most triangles of a level, as a multiple of those requested, without a warning.
 MAX_EXCESS = 1.5
 
 

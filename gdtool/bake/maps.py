@@ -1,4 +1,4 @@
-"""Make the maps that files hold: pack and quantise values, and leave out what is constant."""
+"""Make the maps to store: pack and quantise values, and leave out what is constant."""
 
 from __future__ import annotations
 
@@ -110,9 +110,9 @@ def quantise(image: np.ndarray, bits: int) -> np.ndarray:
 def constant_of(
     values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x
 ) -> np.ndarray | None:
-    """Return the middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None.
+    """Return the middle of values (n,) or (n, c), float64, where no channel spans more than `tolerance`, else None.
 
-    Both are measured after encoding, a monotonic function.
+    The span and the result are those of encoding(values); encoding is monotonic.
     """
     if not len(values):
         return None

@@ -60,7 +60,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
     slot[coarse.texel] = np.arange(len(coarse), dtype=np.int32)
     at, facing, _, _ = surface_at(target, coarse.face_idx, coarse.barycentric)
     spacing = np.float32(_spacing(at, slot.reshape(coarse.size, coarse.size)))
-    # Of each coarse texel: position in units of the spacing, normal and visibility; one gather reads all.
+    # For each coarse texel its position in units of the spacing, normal and visibility: one gather reads all seven.
     known = np.concatenate([at / spacing, unit(facing), trace(coarse.face_idx, coarse.barycentric)[:, None]], 1)
     known[:, 6] = _smoothed(known, slot.reshape(coarse.size, coarse.size))
     out = np.zeros(len(texels), np.float32)
@@ -91,7 +91,7 @@ def bake_occlusion(target: Target, texels: Texels, trace, scale: int = 4, thread
     unmatched = np.flatnonzero(~has_similar[: texels.inside])
     if len(unmatched):
         out[unmatched] = trace(texels.face_idx[unmatched], texels.barycentric[unmatched])
-    # Beyond a crease the surface faces elsewhere: the rings around charts continue their inside instead.
+    # Beyond a crease the surface faces elsewhere: the rings around charts are filled from within the charts instead.
     continue_into_rings(texels, out)
     return out
 

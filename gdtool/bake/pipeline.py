@@ -16,17 +16,17 @@ from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 
-# Looks the material of n places up: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in world
+# A function that looks up the material at n places: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in world
 # axes, and alpha (n,) where the source has one.
 Lookup = Callable[[Places], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class ViewsOfSource:
-    """Views of the source, and what their cameras see of it.
+    """Views of the source: their images, and the depths and silhouettes that their cameras see.
 
-    images: (k, h, w[, c]) by domain: albedo linear, roughness, metallic, normal. mask (k, h, w) coverage. picture: the
-    finer picture that one of the views was made from.
+    images: (k, h, w[, c]) by domain: albedo linear, roughness, metallic, normal. mask (k, h, w): coverage. picture: the
+    one of higher resolution that one of the views was made from.
     """
 
     visibilities: list[ViewVisibility]

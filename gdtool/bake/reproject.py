@@ -15,7 +15,7 @@ from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.tangents import dot, number_distinct_rows
 
-# The least dot product of the source face's normal with the mesh's normal at which the face is on the right side.
+# The least dot product of a source face's normal and the mesh's normal at which the two agree.
 AGREEMENT = 0.1
 # Faces that a ray meets before it gives up.
 _RETRIES = 4
@@ -177,7 +177,7 @@ def _march(
     cosine = dot(source.normals_of(face), normals)
     good = near & (cosine > AGREEMENT)
     back = near & (cosine < -AGREEMENT) & (not through)
-    # Hits on the other side of a wall: step through it and continue.
+    # Hits on the other side of a wall: pass through it and continue.
     active = np.flatnonzero(near & ~good & ~back)
     face[~(good | back)] = -1
     distance = np.where(good, np.abs(t), np.float32(np.inf))
@@ -239,7 +239,7 @@ def _slide_off_edges(
     cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
     away = source.at(face[slanted], barycentric[slanted], source.mesh.vertices) - points[slanted]
-    # Distance from the hit to the nearest place, if the face were a plane.
+    # Distance from the hit to the nearest point, if the face were an infinite plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
     slanted = slanted[beside > 2e-5 * source.extent]
     if not len(slanted):
@@ -273,7 +273,8 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     """
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
-    # Between two sheets that face the same way lies a third: outward there is nothing nearer than so near a hit.
+    # Where the inward hit is very near, no agreeing face lies outward that is nearer still: between two sheets that face
+    # the same way lies one that faces the other way.
     far = np.flatnonzero(distance > 5e-4 * source.extent)
     out_face, out_distance, out_at, _ = _march(
         points[far], normals[far], normals[far], np.minimum(reach, distance)[far], source, start

@@ -15,8 +15,8 @@ from gdtool.geometry.tangents import corner_tangents, edge_pairs, tangent_frames
 from gdtool.geometry.uv_raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 
 CREASE_DEGREES = 45.0  # smooth normals are split along edges that bend more
-# Texels that are worked on at once: few enough to stay near the cache. And enough for libigl, which holds Python's lock
-# while it searches nearest points, to use all cores: it does so from 10,000 points on.
+# Texels in one batch: few enough for the cache, and enough for libigl to use all cores, which it does from 10,000 points
+# on. It holds Python's lock while it searches for nearest points.
 TEXELS_AT_ONCE = 65_536
 # A texel wider than this many times the source's detail needs more than one sample (docs/numerics.md).
 COARSE_TEXEL = 3.0

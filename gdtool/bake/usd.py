@@ -37,8 +37,9 @@ def write_usd(
 ) -> None:
     """Write a .usda, or a .usdz that packs it with its maps.
 
-    files: file name, beside path, by map name. convention: "opengl" or "directx", of normal.png. Units and axes are
-    glTF's: metres, Y up, right-handed. Raises OutputError when the package cannot be written.
+    files: file name, beside path, by map name. convention: "opengl" or "directx", the direction of the green channel of
+    normal.png. Units and axes are glTF's: metres, Y up, right-handed. Raises OutputError when the package cannot be
+    written.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 

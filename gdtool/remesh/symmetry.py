@@ -82,8 +82,8 @@ def half_mesh(mesh: TriMesh, axis: int) -> TriMesh:
 def join_with_mirror(mesh: QuadMesh, axis: int, edge: float, surface: ProjectionTarget | None = None) -> QuadMesh:
     """Join a half of quads and its reflection into one mesh.
 
-    Boundary vertices near the plane move onto it and are shared. Quads that this folds are untangled on `surface`,
-    where it is given. edge: length of the quads' sides.
+    Boundary vertices near the plane move onto it and are shared. Quads that fold in this way are untangled on
+    `surface`, unless it is None. edge: length of the quads' sides.
     """
     vertices, quads = mesh.vertices, mesh.faces
     edges = topology.edges_of(quads)

@@ -126,9 +126,9 @@ class Candidate:
         return self.count / wanted - 1
 
     def rank(self, wanted: float, tolerance: float) -> tuple:
-        """Return a sort key, smaller is better: faultless, then near the count, then few irregular vertices.
+        """Return a sort key, smaller is better: without a fault, then near the count, then few irregular vertices.
 
-        tolerance: relative errors of the count below this are equal.
+        tolerance: relative errors of the count below this count as equal.
         """
         return self.fault is not None, max(abs(self.count_error(wanted)), tolerance), self._irregular_count()
 

@@ -233,9 +233,9 @@ class Constraints:
 def trace_features(mesh: QuadMesh, features: Features, edge: float) -> tuple[np.ndarray, Constraints]:
     """Snap paths of quad edges to the feature curves.
 
-    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
-    not cross one another. Returns vertices (v, 3), those of paths moved onto the curves, and the constraints that hold
-    them there.
+    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do not cross one
+    another. Returns vertices (v, 3), in which those on paths lie on the curves, and the constraints that hold them
+    there.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if not features:

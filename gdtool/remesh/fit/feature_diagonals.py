@@ -49,7 +49,7 @@ def quads_crossed_by_features(
 
 
 def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray) -> Constraints:
-    """Hold the centres of crossed quads (k,) to their curve (k,) in the constraints of the subdivided mesh.
+    """Hold the centres of quads (k,) to the curve (k,) that crosses them, in the constraints of the subdivided mesh.
 
     first_centre: the vertex at the centre of face 0.
     """

@@ -78,7 +78,7 @@ def snap_to_features(
     subdivisions: int,
     request: Request,
 ) -> SnappedQuads:
-    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude tips that they cut short."""
+    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude them over tips that they leave out."""
     vertices, faces = mesh.vertices, mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(faces)) ** 0.5
     vertices, traced = trace_features(
@@ -146,9 +146,10 @@ def fit_to_surface(
 
 
 def finalize(fitted: FittedQuads, full_surface: ProjectionTarget, request: Request) -> QuadMesh:
-    """Balance the heights of fitted quads about the full surface, and choose the diagonals that follow it.
+    """Balance the heights of fitted quads about the full surface (squaring.balance_heights), and choose their
+    diagonals.
 
-    full_surface: the input before it was simplified.
+    full_surface: the input before it was simplified. The diagonals are those that follow it.
     """
     mesh = fitted.mesh
     if request.smooth_iterations:
@@ -217,7 +218,8 @@ def keep_better_vertices(
 ) -> np.ndarray:
     """Choose for each vertex its smoothed position or its original one, by piece and by quad.
 
-    moved (v, 3) and constraints are those of smoothed(). Smoothed positions are balanced about the full surface first.
+    moved (v, 3) and constraints are those of smoothed(). Before the choice, the smoothed quads are moved so that as
+    much of the full surface lies above as below them (squaring.balance_heights).
     """
     quad_vertices, quad_faces = mesh.vertices, mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(quad_faces)) ** 0.5

@@ -231,7 +231,7 @@ def neighbours(ends: np.ndarray, count: int) -> GroupedLists:
 def fill_holes(mesh: QuadMesh, longest: int = 64) -> QuadMesh:
     """Close boundary loops with an even number of edges, at most `longest`, by quads around a new vertex.
 
-    Where two holes meet at a vertex, each is closed by itself.
+    Where two holes meet at a vertex, they are closed separately.
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)

@@ -221,7 +221,9 @@ def _improve_layouts(masks: ChartMasks, layouts: list[Layout], max_placed: int, 
     if not layouts or max_placed < _CHAINS * len(layouts[0].order):
         return layouts
     tries = max_placed // len(layouts[0].order) // _CHAINS
-    seeds = sorted(range(_CHAINS), key=lambda seed: seed % 2)  # of layouts of one size the first chain's is taken
+    seeds = sorted(
+        range(_CHAINS), key=lambda seed: seed % 2
+    )  # where layouts are equally large, the first chain's is taken
     more = [layout for seed in seeds for layout in _improvement_chain(masks, layouts[0], tries, seed, until)]
     return sorted(layouts + more, key=lambda layout: layout.side)
 

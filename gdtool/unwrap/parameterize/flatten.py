@@ -32,9 +32,9 @@ class FlattenResult(NamedTuple):
 def flatten(mesh: TriMesh, good_stretch: float, max_stretch: float) -> FlattenResult:
     """Flatten one connected chart, a manifold with boundary, to uv (v, 2), v up, at the scale of the surface.
 
-    Least-squares conformal map (Lévy et al. 2002), or
-    Tutte's embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until
-    good_stretch is reached. A chart beyond max_stretch has to be cut.
+    It starts from the least-squares conformal map (Lévy et al. 2002), or from Tutte's embedding where that folds. SLIM
+    (Rabinovich et al. 2017) then lowers the symmetric Dirichlet energy until good_stretch is reached. A chart beyond
+    max_stretch has to be cut.
     """
     triangles = mesh.faces
     edges = edges_of(triangles)

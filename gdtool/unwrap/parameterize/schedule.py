@@ -208,9 +208,10 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
 
 
 def _split_set(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
-    """Split a chart's faces into two or more connected sets, between its parts where it has several.
+    """Split a chart's faces into two or more connected sets, along the borders of its parts where it has several.
 
-    part (f,): seams between parts begin and end at creases.
+    part (f,): the part of its chart that each face is in (Segmentation.part). Seams between parts begin and end at
+    creases.
     """
     half, area = split_in_half(adjacency, faces_idx), adjacency.area[faces_idx]
     if half.all() or not half.any():

@@ -25,7 +25,7 @@ _CREASE_COST = 0.1  # ... where a seam costs this share of its length
 _MIN_CHILD_SECONDS, _CHILD_MEMORY_MB = 0.05, 8000
 _MIN_CHART_SHARE = 0.003  # of the area: a smaller chart merges with a neighbour if it has one
 _MIN_CHART_FACES = 8  # so does a chart of fewer faces, or of one in 64 of a small mesh
-# What a face adds to the vote for its own label, in typical edge costs: for its first label, and for one it took on.
+# Bonus in a face's vote for the label that it has, in typical edge costs: its first label, and one that it took on.
 _FIRST_BONUS, _LATER_BONUS = 0.4, 0.1
 _MAX_MERGES = 20  # rounds of merging small charts
 _CREASE_FACTOR = 5.0  # times longer is the way across a crease, so that halves part there
@@ -103,7 +103,7 @@ class Adjacency:
         )[1]
 
     def connected_labels(self, label: np.ndarray) -> np.ndarray:
-        """Split labels (f,) so that each connected set of faces of one label has its own."""
+        """Split labels (f,) until the faces of each label are connected."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
