@@ -16,8 +16,8 @@ from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 
-# A function that looks up the material at n places: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in world
-# axes, and alpha (n,) where the source has one.
+# A function that looks up the material at n places: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3)
+# unit in world axes, and alpha (n,) where the source has one.
 Lookup = Callable[[Places], dict[str, np.ndarray]]
 
 

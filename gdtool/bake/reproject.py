@@ -273,8 +273,8 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     """
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
-    # Where the inward hit is very near, no agreeing face lies outward that is nearer still: between two sheets that face
-    # the same way lies one that faces the other way.
+    # Where the inward hit is very near, no agreeing face is nearer outward: between two sheets that face the same way
+    # lies one that faces the other way.
     far = np.flatnonzero(distance > 5e-4 * source.extent)
     out_face, out_distance, out_at, _ = _march(
         points[far], normals[far], normals[far], np.minimum(reach, distance)[far], source, start

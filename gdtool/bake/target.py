@@ -15,7 +15,7 @@ from gdtool.geometry.tangents import corner_tangents, edge_pairs, tangent_frames
 from gdtool.geometry.uv_raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 
 CREASE_DEGREES = 45.0  # smooth normals are split along edges that bend more
-# Texels in one batch: few enough for the cache, and enough for libigl to use all cores, which it does from 10,000 points
+# Texels in one batch: few enough for the cache, and enough for libigl to use all cores, as it does from 10,000 points
 # on. It holds Python's lock while it searches for nearest points.
 TEXELS_AT_ONCE = 65_536
 # A texel wider than this many times the source's detail needs more than one sample (docs/numerics.md).

@@ -36,8 +36,8 @@ from gdtool.remesh.task import QuadResult, Record, RemeshPatch, Request
 
 _PIECE_GAP_EDGES = 8.0  # edge lengths between separated pieces: no step looks at the surface farther away than this
 _MIN_QUADS_PER_HANDLE = 100  # with fewer, engines lose some handles (benchmarks/remesh/nets.py)
-# A multiple of the noise (JITTER_EDGES) that keeps triangles of one size while simplifying. It moves few vertices farther
-# than this off the surface, so those farther away were moved to a restored crease.
+# A multiple of the noise (JITTER_EDGES) that keeps triangles of one size while simplifying. It moves few vertices
+# farther than this off the surface, so those farther away were moved to a restored crease.
 _NOISE_REACH = 3.0
 _MAX_CREASE_EDGE = 0.75  # of the quads' edge: bevels of triangles larger than this are kept as bevels
 _TRIANGLES_PER_QUAD, _MIN_TRIANGLES = 3, 20000  # triangles that show all that the quads can

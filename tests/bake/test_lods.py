@@ -23,11 +23,11 @@ def test_a_level_has_the_requested_triangles_and_keeps_its_texels():
     level, why = coarser(full, len(full.mesh.faces) // 2)
     assert why == ""
     assert abs(len(level.mesh.faces) - len(full.mesh.faces) // 2) <= 2
-    # A quarter of a triangle's edge at most, and no part of the surface that reads another chart.
+    # At most a quarter of a triangle's edge; hardly any of the surface reads another chart.
     drifted = drift(level, full)
     assert drifted["drift_mean"] < 0.008
     assert drifted["outside"] < 0.01
-    # Every chart turns the way it did: a mirrored one would turn its normal map round.
+    # No chart is mirrored: that would invert its normal map.
     u, v = (level.uv[level.face_uvs[:, k]] - level.uv[level.face_uvs[:, 0]] for k in (1, 2))
     whole_u, whole_v = (full.uv[full.face_uvs[:, k]] - full.uv[full.face_uvs[:, 0]] for k in (1, 2))
     turned, whole = (
@@ -41,7 +41,7 @@ def test_size_is_the_power_of_two_that_holds_the_detail():
     full = target()
     width = 1.0 / 512 * _span(full)
     assert size_for(full, width) == 512
-    assert size_for(full, width * 1.05) == size_for(full, width / 1.05) == 512  # a tenth coarser is as fine as asked
+    assert size_for(full, width * 1.05) == size_for(full, width / 1.05) == 512  # up to a tenth coarser is fine enough
     assert size_for(full, width / 1.5) == 1024
     assert size_for(full, width * 1000) == 256
     assert size_for(full, width / 1000) == 4096
@@ -55,7 +55,7 @@ def _span(full):
 
 def test_a_level_that_drifts_on_its_maps_is_left_out(monkeypatch):
     full = target()
-    # A level whose texture corners are those of the opposite side.
+    # A level whose texture corners belong to the opposite side.
     half, _ = coarser(full, len(full.mesh.faces) // 2)
     wrong = replace(half, mesh=TriMesh(half.mesh.vertices * (-1, 1, 1), half.mesh.faces))
     monkeypatch.setattr(

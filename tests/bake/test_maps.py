@@ -95,7 +95,7 @@ def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
     np.testing.assert_array_equal(at[:, :3], np.tile(at[~hidden][0, :3], (len(at), 1)))
     assert stored[..., :3].min() > 100
     np.testing.assert_array_equal(at[:, 3], np.rint(inputs["alpha"] * 255))
-    inputs["alpha"][hidden] = 1.1 * least + 0.01  # is seen: stays as it is
+    inputs["alpha"][hidden] = 1.1 * least + 0.01  # visible, so the color stays
     at = make_maps(texels, inputs, options=MapOptions(least_alpha=least)).base_color.reshape(-1, 4)[texels.texel]
     assert at[hidden][:, :3].max() == 0
 

@@ -46,7 +46,7 @@ def test_views_give_what_they_see_and_vertices_everything_else(surface):
     places = places_on(surface)
     read = origin.lookup(places)
     points = at(origin, places)
-    # Six views at eye level see the outside of the ring; its inner side and its very top they do not.
+    # Six views at eye level see the outside of the ring, but neither its inner side nor its top.
     outside = (np.linalg.norm(points[:, [0, 2]], axis=1) > 0.42) & (read["seen"] > 0.95)
     assert outside.mean() > 0.3
     assert psnr(read["albedo"][outside], albedo_of(points[outside])) > 32
@@ -106,7 +106,7 @@ def test_a_view_that_disagrees_with_the_others_is_left_out(surface):
     points = at(origin, places)
     read = origin.lookup(places)["albedo"]
     toward = (surface.normals[surface.faces[places.face_idx, 0]] * (np.sqrt(0.5), 0, np.sqrt(0.5))).sum(1) > 0.9
-    # Front and right see what front right faces, at 45 degrees, and the vertices agree with them.
+    # The front and right views see the same surface at 45 degrees, and the vertices agree with them.
     error = np.abs(read[toward] - albedo_of(points[toward])).max(1)
     assert (error < 0.1).mean() > 0.8
 

@@ -70,7 +70,7 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
 def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus_bake):
     target, texels, source, _, reach, _ = torus_bake
 
-    # Above the middle stripes finer than a texel, whose mean is one half; below it one half everywhere.
+    # The upper half has stripes finer than a texel, whose mean is one half; the lower half is one half everywhere.
     def stripes(places):
         y = source.at(places.face_idx, places.barycentric, source.mesh.vertices)[:, 1:2]
         count = len(places.face_idx)
@@ -88,7 +88,7 @@ def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus
 
 
 def test_thin_wall_does_not_bleed_through():
-    # A plate 0.4 % thick, red above and blue below; the mesh that is baked lies off it by twice its thickness.
+    # A plate 0.4 % thick, red above and blue below; the baked mesh is off by twice its thickness.
     vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5]])
     top, bottom = vertices + (0, 0.002, 0), vertices - (0, 0.002, 0)
     up, down = np.array([[0, 2, 1], [0, 3, 2]]), np.array([[4, 5, 6], [4, 6, 7]])

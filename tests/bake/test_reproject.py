@@ -33,7 +33,7 @@ def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
 
 
 def test_thin_wall_is_never_crossed():
-    # A plate 0.1 % thick; the baked mesh strays by several times that, to either side.
+    # A plate 0.1 % thick; the baked mesh is off by several times that, to either side.
     vertices, faces = box((1.0, 1.0, 0.001))
     source = Source(TriMesh(vertices, faces))
     rng = np.random.default_rng(1)
@@ -51,7 +51,7 @@ def test_thin_wall_is_never_crossed():
 def test_the_nearest_point_on_its_side_is_taken_where_the_normal_misses():
     vertices, faces = box((1.0, 1.0, 0.001))
     source = Source(TriMesh(vertices, faces))
-    # Beside the plate: the normal meets nothing, the other side's rim is as near.
+    # Beside the plate: rays along the normal meet nothing, and both sides' rims are equally near.
     points = np.array([[0.6, 0.1, 0.0005], [0.6, 0.1, -0.0005], [0.6, 0.1, -0.0006]])
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]])
     places = reproject(points, normals, np.full(3, 0.01), source)
@@ -71,7 +71,7 @@ def test_reach_covers_the_distance_but_not_the_object():
 
 
 def test_a_one_sided_sheet_is_read_from_behind():
-    # A square at z = 0 that looks along +z, and a floor far below its middle that looks the way its back does not.
+    # A one-sided square at z = 0 that faces +z, and one far below it that faces -z.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     source = Source(
@@ -83,14 +83,13 @@ def test_a_one_sided_sheet_is_read_from_behind():
         places = reproject(points, np.tile([0.0, 0.0, side], (500, 1)), np.full(500, 0.01), source)
         np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
         assert (places.from_behind == (side < 0)).all()
-    # Within reach what looks the same way comes first, however near the sheet.
+    # A face within reach that faces the same way is taken first, however near the sheet is.
     places = reproject(points, np.tile([0.0, 0.0, -1.0], (500, 1)), np.full(500, 0.35), source)
     np.testing.assert_allclose(at(source, places)[:, 2], -0.3, atol=1e-6)
 
 
 def test_nothing_is_read_through_a_one_sided_sheet():
-    # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands
-    # for.
+    # Behind a one-sided sheet lies a face that faces the same way as the baked mesh; it must not be read.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
     source = Source(

@@ -27,6 +27,6 @@ def test_engine_input_is_simplified_where_tears_of_the_collapse_can_be_repaired(
     collapsed = made.faces
     assert len(few) <= len(collapsed) < len(few) + 12
     assert topology.invariants(collapsed) == wanted
-    # What loses half of it is not: the engine has the mesh as it was.
+    # A result that lost half of the mesh cannot be repaired: the input is returned.
     monkeypatch.setattr(simplify, "collapse", lambda *_: TriMesh(few_vertices, few[: len(few) // 2]))
     assert adapters.simplify_for_engine(TriMesh(vertices, faces), 300, wanted).faces is faces

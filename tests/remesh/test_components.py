@@ -71,7 +71,7 @@ def test_good_pieces_of_an_engines_result_are_kept(monkeypatch, hopeless):
     assert whole(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     small = quads_out[(out[quads_out][..., 2] < 0.15).all(1)]
-    # Eight of a ball's hundred; of paired triangles a fifth and more.
+    # An engine's ball of a hundred quads has eight irregular vertices; paired triangles have a fifth or more.
     assert topology_figures(topology.compact(QuadMesh(out, small)))["irregular_share"] < 0.1
     assert (
         distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 5000)["hausdorff"] < 0.02

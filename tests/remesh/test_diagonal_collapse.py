@@ -70,7 +70,7 @@ def test_vertices_held_by_constraints_are_not_collapsed():
     out, quads_out = made.vertices, made.faces
     assert out is torn
     assert quads_out is quads
-    # One of the two is held: it is the one that stays, where it was.
+    # If one of the two corners is on a curve, that corner is kept where it is.
     constraints.curve[new[2]] = -1
     made, after = collapse_folded_quads(QuadMesh(torn, quads), target_of_quads(QuadMesh(vertices, faces)), constraints)
     out, quads_out = made.vertices, made.faces

@@ -92,7 +92,7 @@ def test_edges_at_creases_are_not_rotated():
     for edge in rng.permutation(flat)[:40].tolist():
         try:
             turned = rotated(torn, *edge)
-        except StopIteration:  # turned away before
+        except StopIteration:  # no longer an edge
             continue
         valence = valences(turned, len(points))[0]
         if valence.min() > 2 and topology.is_manifold(turned):

@@ -52,7 +52,7 @@ def test_corners_in_a_row_are_not_all_contracted_into_one():
     features = _clean_arcs(points, segments, short)
     ends = features.points[features.segments]
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() <= 1 + short
-    # No tooth is lost, and the corners that are left stand on the spine.
+    # No tooth is lost, and several corners remain on the spine.
     assert (features.points[:, 1] == length - 1).sum() == teeth
     assert 1 < len(np.unique(ends[ends[..., 1] == 0], axis=0)) < teeth
 

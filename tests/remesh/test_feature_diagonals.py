@@ -23,7 +23,7 @@ def test_a_path_around_a_corner_crosses_its_quad():
     curve = np.full(len(vertices), -1)
     curve[walk] = 3
     before = Constraints(curve, np.zeros(len(vertices), bool), path, np.full(3, 3))
-    # Of the two corners in the staircase one is let off here; the other stays.
+    # One of the staircase's two corners is released here.
     after = Constraints(np.where(np.arange(len(vertices)) == 6, -1, curve), before.fixed, path[2:], np.full(1, 3))
     face_idx, crossing_curve = quads_crossed_by_features(faces, before, after)
     assert len(face_idx) == 1

@@ -44,7 +44,7 @@ def test_the_fallback_takes_the_coarsest_collapse_that_keeps_all_pieces(monkeypa
         return made._replace(mesh=both) if keeps else made
 
     monkeypatch.setattr(fallback, "simplify", losing)
-    requested = 1800  # 800 triangles, of which 1.15 times as many lose the piece and 1.3 times keep it
+    requested = 1800  # 800 triangles; 1.15 times as many lose the piece, 1.3 times keep it
     made = fallback.quads_from_input(TriMesh(vertices, faces), requested, 60.0)
     quads_out = made.faces
     assert tried[:3] == [800, 919, 1040]

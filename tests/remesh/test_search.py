@@ -48,7 +48,7 @@ def test_an_engine_far_from_the_surface_runs_once_and_a_crashing_one_again(monke
         return QuadMesh(out / 2, quads_out)
 
     calls = in_this_process(monkeypatch, engine)
-    # Drawn onto the large sphere the small one would become it.
+    # Without this, fitting would turn the small sphere into the large one.
     monkeypatch.setattr(
         candidates,
         "snap_to_features",
@@ -132,7 +132,7 @@ def test_subdivision_is_given_up_where_walls_are_thinner_than_quads(thickness, t
     wedge = vertices.copy()
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
     assert not RemeshPatch(TriMesh(wedge, faces), 4000, 0.02, Request(), None).has_thin_walls
-    # One side of a sheet is no wall, nor is what lies outside, before it.
+    # A one-sided sheet is no wall, on neither of its sides.
     assert not RemeshPatch(
         TriMesh(vertices, faces[face_normals(TriMesh(vertices, faces))[0][:, 2] > 0.5]),
         2000,
@@ -140,12 +140,12 @@ def test_subdivision_is_given_up_where_walls_are_thinner_than_quads(thickness, t
         Request(),
         None,
     ).has_thin_walls
-    # A coarse mesh is not asked.
+    # A mesh with fewer triangles than quads is not tested.
     assert not RemeshPatch(
         TriMesh(cube()[0] * (0.9, 0.9, thickness), cube()[1]), 4000, patch.edge, Request(), None
     ).has_thin_walls
     assert not RemeshPatch(TriMesh(vertices, faces[:, ::-1]), 4000, patch.edge, Request(), None).has_thin_walls
-    # Without creases, or its narrow sides tell.
+    # No creases, since the plate's narrow sides would count as narrow strips.
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, crease_degrees=0.0))
     quads_out = made.faces
     assert whole(quads_out)
@@ -177,7 +177,7 @@ def test_only_handles_finer_than_a_quad_may_be_lost(monkeypatch, shape, given_up
     assert topology.is_watertight(faces)
     assert topology.is_manifold(faces)
     assert topology.euler_number(faces) == 0
-    in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that makes a ball of it
+    in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that returns a ball
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000))
     quads_out = made.faces
     assert whole(quads_out)
@@ -233,7 +233,7 @@ def test_candidates_are_sorted_in_space(monkeypatch):
 
     assert places(candidate.mesh.vertices, candidate.mesh.faces) == places(vertices, faces)
     ends = topology.edges_of(candidate.mesh.faces).ends
-    # A third of them, on average, where it is by chance.
+    # In random order the mean is a third of the number of vertices.
     assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
 
@@ -263,7 +263,7 @@ def test_uncovered_surface_is_measured():
     surface = ProjectionTarget(TriMesh(vertices, faces))
     closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, open_faces))
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, closed)), surface, (0.1,)) == [0]
-    # The lid but its rim.
+    # All of the lid except a strip along its rim.
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, opened)), surface, (0.1, 2.0)) == pytest.approx(
         [0.8**2 / 6, 0], abs=0.02
     )
@@ -298,7 +298,7 @@ def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(
     assert "cuts off" in record.failed[0]
     assert "SIGSEGV" in record.failed[1]
     assert sum(not attempt.subdivisions for _, attempt, _ in calls) == 1
-    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # fitting stops beyond this distance
     assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)

@@ -51,6 +51,6 @@ def test_tips_are_found_again_after_folded_quads_were_collapsed(monkeypatch):
         shaping.fit_to_surface(
             SnappedQuads(QuadMesh(vertices, quads), constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
         )
-    # of the folded ones alone
+    # only for the quads that are folded
     assert len(released) == 1
     assert np.array_equal(released[0], vertices[tips])

@@ -38,7 +38,7 @@ def test_folded_quads_are_unfolded_on_the_surface():
 
 def test_the_middle_of_three_corners_in_a_line_is_released_from_its_curve():
     vertices, quads = grid()
-    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then round a quad's corner at 40
+    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then around a quad's corner at 40
     curve = np.full(len(vertices), -1)
     curve[[39, 40, 49]] = 0
     fixed = np.zeros(len(vertices), bool)

@@ -57,7 +57,7 @@ def test_quads_are_extruded_over_a_horn(length, bend):
     assert len(constraints.curve) == len(out)
     apex = surface.vertices[surface.vertices[:, 0].argmax()]
     assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
-    # The quads away from the horn are those that were there.
+    # Quads away from the horn are unchanged.
     same = (vertices == out[: len(vertices)]).all(1)
     assert same.sum() > 0.97 * len(vertices)
     assert (vertices[~same, 0] > 0.3).all()
@@ -72,7 +72,7 @@ def test_no_more_quads_than_allowed_are_added():
         edge,
         max_added=0.01,
     ).mesh.faces
-    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # 40: quads of the last step
 
 
 def test_surface_near_the_quads_is_not_extruded():
@@ -91,7 +91,7 @@ def test_uncovered_surface_is_measured_by_area_and_not_by_vertices():
     vertices, faces, edge = ball()
     fine, triangles = sphere(160, 0.4)
     narrow = fine[:, 0] > 0.39
-    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
+    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than the height of a tip
     many = ProjectionTarget(TriMesh(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3)))
     assert (many.vertices[:, 0] > 0.39).mean() > 0.5
     far, away = extrude_tips(QuadMesh(vertices, faces), Constraints.none(len(vertices)), many, edge)[3:]
@@ -173,7 +173,7 @@ def test_fixed_vertices_on_a_blunt_tip_leave_room_for_quads():
     """Vertices fixed as near to each other as their target points would leave quads without area between them."""
     vertices, faces, edge = ball()
     fine, triangles = sphere(160, 0.4)
-    # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
+    # A ridge some edges wide and a tenth of that thick: all vertices of its cap move about equally far.
     blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
     fine[blunt, 0] += 1.4 * edge
     made, _, tips, _, _ = extrude_tips(

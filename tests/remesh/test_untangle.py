@@ -53,7 +53,7 @@ def test_fixed_vertices_move_in_the_last_rounds_only():
     surface, features = ProjectionTarget(TriMesh(*plane())), find_features(TriMesh(*plane()), 181.0, 1.0)
     early = untangle(
         QuadMesh(vertices, faces), surface, features, constraints, max_visits=10
-    )  # no visit is left for the last rounds
+    )  # too few visits to reach the last rounds
     assert np.array_equal(early[pulled], vertices[pulled])
     out = untangle(QuadMesh(vertices, faces), surface, features, constraints)
     assert scaled_jacobian(QuadMesh(out, faces)).min() > scaled_jacobian(QuadMesh(vertices, faces)).min()
@@ -70,7 +70,7 @@ def test_vertices_on_a_crease_slide_along_it():
     curve_of_vertex = np.full(len(vertices), -1)
     curve_of_vertex[on[1:-1]] = curve
     moved = vertices.copy()
-    moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next one
+    moved[on[1], 0] = vertices[on[2], 0] + 0.3 * (vertices[on[3], 0] - vertices[on[2], 0])  # past the next vertex
     assert scaled_jacobian(QuadMesh(moved, faces)).min() <= 0
     out = untangle(
         QuadMesh(moved, faces),

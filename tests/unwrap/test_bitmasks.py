@@ -20,10 +20,10 @@ def test_a_mask_covers_the_chart_and_the_gap_but_not_its_hole(gap):
         size = max(mask.shape)
         covered = owner_count(uv / size, RING_TRIANGLES, size)[: mask.shape[0], : mask.shape[1]] > 0
         assert (mask | ~covered).all()
-        # Half a gap around it, and at most a cell and a half more.
+        # The mask has half a gap around the chart, and at most a cell and a half more.
         assert mask.sum() <= (4 * 9 + gap + 3) * (4 * 7 + gap + 3) - (4 * 5 - gap - 3) * (4 * 3 - gap - 3)
         assert not mask[tuple(np.array(mask.shape) // 2)]
-    # By half a cell: about as much as the chart has itself.
+    # Cells that are half covered: their area is about that of the chart.
     half = rotated_masks(rim, RING, 4.0, 0.0, 0.5)[0][0]
     assert half.sum() == pytest.approx(16 * (63 - 15), rel=0.02)
 
@@ -57,7 +57,7 @@ def test_places_blocked_by_charts_are_those_where_cells_are_taken():
     square, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     boxed = [(RING, ring)] * 2 + [(square * side, outline_of(square * side, triangles)) for side in sides]
     shapes = ChartMasks(boxed, 2.0, 1.5, 44)
-    border, taken, others = shapes.border(40), 0, []  # a smaller square than they are made for
+    border, taken, others = shapes.border(40), 0, []  # a smaller square than the masks' side
     for i in range(8):
         place = shapes.find_place(i, taken, border, 40, 0.5)
         assert shapes.find_place(i, taken, border, 40, 0.5, others) == place is not None

@@ -31,7 +31,7 @@ def test_only_the_overlapping_end_of_a_spiral_is_removed():
     triangles, face_idx = triangulated(faces)
     assert 0 < overlapping_triangles(uv, triangles).mean() < 0.2
     keep = remove_overlaps(Adjacency(QuadMesh(vertices, faces)), np.arange(len(faces)), triangles, face_idx, uv)
-    # One of the two ends, not both; the rest lies apart.
+    # One of the two ends is removed, not both; nothing overlaps any more.
     assert 0.9 < keep.mean() < 0.97
     assert not overlapping_triangles(uv, triangles[keep[face_idx]]).any()
 
@@ -115,8 +115,8 @@ def test_a_piece_is_added_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
     assert not count
     assert len(charts[0][0]) == len(dome)
     assert sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
-    # tried.
+    # The piece is not placed if its only flat neighbour is the chart it was removed from, if no neighbour lies flat
+    # with it, or once the limit of work is reached.
     assert unplaced(flat, [flat])[0] == 1
     assert unplaced(dome, [flat])[0] == 0
     assert unplaced(piece, [dome], 1 + 1e-9)[0] == 1
@@ -131,7 +131,7 @@ def test_a_chart_much_larger_than_a_piece_keeps_its_coordinates(columns, stays):
     piece, others = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
     made = chart_mesh(QuadMesh(vertices, faces[others]))
     points, corners = made.vertices, made.faces
-    # Bent and slanted: laid anew it would not come to lie so.
+    # Slanted coordinates, which flattening again would not reproduce.
     flat_uv = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
     charts = [Chart(others, corners, flat_uv, triangulated(corners)[0])]
     assert not give_to_neighbours(

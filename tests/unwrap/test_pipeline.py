@@ -67,7 +67,7 @@ def test_torus_has_uniform_density_and_gaps():
     assert figures["stretch"] < 1.1
     assert figures["area_distortion"] < 1.3
     assert figures["charts"] <= 16
-    # Charts stay 4 texels of 512 apart: growing each by a texel and a half makes none meet.
+    # Charts stay 4 texels of 512 apart, so they do not meet when each is grown by a texel.
     from scipy.ndimage import binary_dilation
 
     from gdtool.geometry.topology import triangulated
@@ -191,7 +191,7 @@ def test_cylinder_side_is_developable():
 def test_stretch_of_known_maps():
     vertices, triangles = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     assert stretch(TriMesh(vertices, triangles), 7 * vertices[:, :2]) == pytest.approx(1)
-    # Stretched by two one way: sqrt((a + 1/a) / 2) with a = 2.
+    # Stretched by two in one direction: sqrt((a + 1/a) / 2) with a = 2.
     assert stretch(TriMesh(vertices, triangles), vertices[:, :2] * [2, 1]) == pytest.approx((2.5 / 2) ** 0.5)
 
 
@@ -222,7 +222,7 @@ def test_four_rotated_squares_are_set_upright_and_packed_tight():
     for uv in places:
         assert uv.min() >= 0
         assert uv.max() <= 1
-        assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # turned, never mirrored
+        assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # rotated, never mirrored
         assert np.linalg.norm(uv[1] - uv[0]) == pytest.approx(scale)
     assert 4 * scale**2 > 0.8
     assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(4)]), 512) <= 1).all()
@@ -268,7 +268,7 @@ def test_a_rim_that_hardly_crosses_itself_is_found():
     ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
     assert not len(rim_crossings(square, ends)[0])
     assert rim_crossings(square[[0, 2, 1, 3]], ends)[0].tolist() == [0, 2]
-    # A strip of upright triangles bent almost into a ring: its ends pass each other by a millionth.
+    # A strip of triangles bent into a ring, whose ends miss or pass each other by a millionth.
     for turn, crosses in ((2 * np.pi - 1e-6, False), (2 * np.pi + 1e-6, True)):
         angle = np.repeat(np.linspace(0, turn, 65), 2)
         radius = np.tile([1.0, 2.0], 65)
@@ -337,9 +337,9 @@ def test_sets_of_more_charts_are_not_tried_where_few_fill_the_square():
     chosen, share, *_ = choose_cut([few, many], 1 / 512)
     assert chosen == 0
     assert share > WELL_PACKED
-    # Where the first fills it badly, those that fill it are taken.
+    # Where the first set fills it badly, a later one that fills it is taken.
     assert choose_cut([narrow, many], 1 / 512)[0] == 1
-    # Where it fills much less, the next ones are leapt over, though never the last.
+    # Where a set fills much less, the next ones are skipped, but never the last.
     strips = grid(2, (3.0, 0.3))
     assert choose_cut([strips, few, many], 1 / 512)[::3] == (2, 1)
     assert choose_cut([strips, many], 1 / 512)[::3] == (

@@ -42,7 +42,7 @@ def test_the_chart_whose_rectangle_is_emptiest_is_cut_first():
     assert len(first) == 4
     assert {ell(10, 4).sum(), 144} <= set(sizes)
     parts = [chart for chart in first if len(chart[0]) not in (ell(10, 4).sum(), 144)]
-    # The two arms of the large one: their rectangles are full.
+    # The two arms of the large L: they fill their rectangles.
     assert all(np.prod(np.ptp(chart[2], 0)) < 1.2 * len(chart[0]) for chart in parts)
 
 

@@ -78,7 +78,7 @@ def snap_to_features(
     subdivisions: int,
     request: Request,
 ) -> SnappedQuads:
-    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude them over tips that they leave out."""
+    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude them over tips."""
     vertices, faces = mesh.vertices, mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(faces)) ** 0.5
     vertices, traced = trace_features(
@@ -146,10 +146,9 @@ def fit_to_surface(
 
 
 def finalize(fitted: FittedQuads, full_surface: ProjectionTarget, request: Request) -> QuadMesh:
-    """Balance the heights of fitted quads about the full surface (squaring.balance_heights), and choose their
-    diagonals.
+    """Balance the heights of fitted quads about the full surface, and choose the diagonals that follow it.
 
-    full_surface: the input before it was simplified. The diagonals are those that follow it.
+    full_surface: the input before it was simplified. Balance: see squaring.balance_heights.
     """
     mesh = fitted.mesh
     if request.smooth_iterations:
