@@ -155,8 +155,8 @@ def read_origin(
     """Read what to bake from: the surface with its views, or else a model.
 
     The model is the one that `choice` names, or the one that the mesh was remeshed from. source: what the mesh was read
-    from. matrix (4, 4): from the normalised frame to the model's. Also returns whether the faces of what was read were
-    turned round, because most of them faced away from the target's.
+    from. matrix (4, 4): from the normalised frame to the model's. Also returns whether the source's faces were flipped,
+    because nine in ten faced away from the target's.
     """
     origin = _origin(source, choice, target, matrix)
     vertices, faces = target.mesh.vertices, target.mesh.faces
@@ -166,7 +166,7 @@ def read_origin(
 
 
 def _origin(source: Folder | Path | str, choice: SourceChoice, target: Target, matrix: np.ndarray) -> Origin:
-    """Read the surface with its views, or else the model, as read_origin() does, but without turning faces."""
+    """Read the surface with its views, or else the model, as read_origin() does, but without flipping faces."""
     if choice.model is None and choice.surface is not None:
         return _surface_origin(choice)
     from gdtool.assets.load import load_scene

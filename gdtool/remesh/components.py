@@ -51,10 +51,10 @@ def split_small_pieces(patch: RemeshPatch) -> tuple[RemeshPatch | None, RemeshPa
 
 
 def accept_good_pieces(patch: RemeshPatch, whole: Candidate | None) -> tuple[QuadResult | None, np.ndarray]:
-    """Judge each piece of an engine's result by itself, and return the finalized quads of the good ones.
+    """Judge each piece of an engine's result by itself; return the finalized quads of the good pieces.
 
-    whole: the engine's quads of all pieces. Returns None where no piece is good, and (pieces,) bool: the accepted
-    pieces.
+    whole: the engine's quads of all pieces. The result is None where no piece is good. Also returns (pieces,) bool: the
+    accepted pieces.
     """
     (count, piece), good = patch.pieces, np.zeros(patch.pieces[0], bool)
     if whole is None or count > patch.quads / SMALL_PIECE_QUADS:

@@ -47,7 +47,7 @@ def remesh(mesh: TriMesh, request: Request) -> tuple[QuadMesh, Record]:
     """Remesh a clean triangle mesh (repair.clean) to quads; return them and the record of how they were made.
 
     mesh: in a unit box. No face of the result is a triangle. The result is closed and manifold where the input is.
-    Pieces that nearly touch are moved apart for the time, so that no quads are fitted to a neighbouring piece.
+    Pieces that nearly touch are moved apart while it runs, so that no quads are fitted to a neighbouring piece.
     """
     if len(mesh.faces) > _triangles_needed(request):
         prepare(collapse_in_child, CHILD_MODULES)

@@ -245,7 +245,7 @@ def keep_better_vertices(
 def _abandoning_faces(surface: ProjectionTarget, mesh: QuadMesh, moved: np.ndarray, distance: float) -> np.ndarray:
     """Find the faces (k,) whose move leaves some of the surface uncovered.
 
-    It is then farther than `distance` from all quads, and twice as far as before.
+    Such surface is then farther than `distance` from all quads, and twice as far as before.
     """
     points = sample_surface(surface.mesh, _SURFACE_SAMPLES, np.random.default_rng(0))[0]
     triangles, face_idx = mesh.triangulation

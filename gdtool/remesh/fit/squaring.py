@@ -61,8 +61,8 @@ def square_up(
 ) -> np.ndarray:
     """Move vertices so that the quads get right angles, on the surface and on the feature curves.
 
-    Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That plane fixes
-    the orientation of each rectangle, so folded quads are pulled back over. Returns the best vertices (v, 3) of all
+    This is shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That
+    plane fixes the orientation of each rectangle, so folded quads are unfolded. Returns the best vertices (v, 3) of all
     rounds: those with the fewest folded quads, then the largest mean Jacobian. strength: over-relaxation; at 1.2 ten
     rounds do what takes fifteen at 0.8.
     """

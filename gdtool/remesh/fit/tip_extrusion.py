@@ -59,9 +59,9 @@ def extrude_tips(
     """Extrude quads of mean edge length `edge` over the parts of the surface that they leave uncovered.
 
     The farthest tip goes first. The vertices nearest to it move along it, an edge or two at a time, with the quads
-    around them, and each step inserts a ring of new quads, as one models a horn by hand. It ends when max_added quads
-    are new: surfaces that need more have other faults than tips. A tip nearer than an edge takes one vertex and no
-    ring. The quads stay closed and manifold where they were, with as many pieces and handles.
+    around them, and each step inserts a ring of new quads, as one models a horn by hand. It ends when the share
+    max_added of the quads is new: surfaces that need more have other faults than tips. A tip nearer than an edge takes
+    one vertex and no ring. The quads stay closed and manifold where they were, with as many pieces and handles.
     """
     vertices, faces = mesh.vertices, mesh.faces
     step = max(len(surface.vertices) // _SAMPLES, 1)

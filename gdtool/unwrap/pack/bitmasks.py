@@ -290,8 +290,8 @@ def _free_places(
 ) -> int:
     """Return the places in a square of `side` cells where a chart is clear of the taken cells, as bits.
 
-    runs and size (h, w) of the chart. windows: a cache for rows and for columns. By level k it holds the cells that
-    start 2**k cells of which any is taken.
+    runs and size (h, w) of the chart. windows: a cache for rows and for columns. By level k it holds the cells from
+    which on at least one of 2**k cells is taken.
     """
     free, hit = _repeat_row((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
     for number, (axis, level, first_start, second_start) in enumerate(runs, 1):

@@ -114,9 +114,9 @@ def parameterize(
 ) -> ParameterizedCharts:
     """Flatten sets of faces, and cut those that do not lie flat.
 
-    A set of several merged labels that stretches more than a single one may is first split by label again.
-    removes_overlaps: where little of a chart lies on other parts of it, only that is removed. project_only: flatten by
-    projection to a plane alone.
+    A set merged of several labels may stretch less than a set of one label. Where it stretches more, it is first split
+    by label again. removes_overlaps: where little of a chart lies on other parts of it, only that is removed.
+    project_only: flatten by projection to a plane alone.
     """
     flat, queue = ParameterizedCharts(), sets[::-1]
     while queue:

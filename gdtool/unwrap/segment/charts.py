@@ -191,7 +191,7 @@ def find_charts(adjacency: Callable[[], Adjacency], mesh: QuadMesh, *, until: fl
 
 
 def chart_mesh(mesh: Mesh) -> Mesh:
-    """Make a mesh of a chart's faces alone, with a vertex doubled where the chart touches itself in it.
+    """Make a mesh of a chart's faces alone; a vertex in which the chart touches itself is doubled.
 
     mesh: some faces of a mesh in which each vertex has one fan of faces; vertices of other faces are left out.
     """
