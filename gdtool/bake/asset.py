@@ -137,7 +137,7 @@ def write_obj(
     files: the file name of each map, by the map's name.
     """
     library = path.with_suffix(".mtl")
-    lines = [f"mtllib {library.name}", f"o {_word(name)}"]
+    lines = [f"mtllib {library.name}", f"o {_object_name(name)}"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
     lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uv.tolist()]
     lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in corners.normals.tolist()]
@@ -150,7 +150,7 @@ def write_obj(
     library.write_text(material_library(maps, files))
 
 
-def _word(name: str) -> str:
+def _object_name(name: str) -> str:
     """Replace the characters that an .obj object name cannot contain by underscores."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "object"
 

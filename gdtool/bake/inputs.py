@@ -10,7 +10,7 @@ import numpy as np
 
 from gdtool.bake.origin import Origin, from_scene, from_surface, material_field
 from gdtool.bake.picture import Picture, picture_of
-from gdtool.bake.target import Target, fineness, texel_width
+from gdtool.bake.target import Target, size_and_samples, texel_width
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.folders.mesh import read_mesh, read_obj
@@ -40,8 +40,8 @@ class SourceChoice:
 
     surface, views: folders, None where there are none. model: a model file or procedural:SEED that replaces the
     surface. project_views: whether to read the views. size: side of the maps in texels; samples: samples per texel;
-    None chooses either by the source's detail (target.fineness). device: the torch device for networks. skipped: (what,
-    why) of each input that was left out; reading appends to it.
+    None chooses either by the source's detail (target.size_and_samples). device: the torch device for networks.
+    skipped: (what, why) of each input that was left out; reading appends to it.
     """
 
     surface: Folder | None
@@ -161,7 +161,7 @@ def read_origin(
     origin = _origin(source, choice, target, matrix)
     vertices, faces = target.mesh.vertices, target.mesh.faces
     few = slice(None, None, max(1, len(faces) // MOST_COMPARED))
-    turned = origin.source.turn_to(vertices[faces[few]].mean(1), target.normals[few].mean(1))
+    turned = origin.source.flip_if_inside_out(vertices[faces[few]].mean(1), target.normals[few].mean(1))
     return origin, turned
 
 
@@ -172,7 +172,7 @@ def _origin(source: Folder | Path | str, choice: SourceChoice, target: Target, m
     from gdtool.assets.load import load_scene
 
     def footprint(detail: float) -> float:
-        size, samples = fineness(target, detail, choice.size, choice.samples)
+        size, samples = size_and_samples(target, detail, choice.size, choice.samples)
         # Bilinear lookups average as well: a mip level as coarse as the sample is wide would blur twice.
         return 0.5 * texel_width(target, size) / samples**0.5
 

@@ -103,7 +103,7 @@ def from_surface(
             lookup, label = _with_field(lookup, source, field, missing), "field: " + " ".join(missing)
     if "normal" in images and not _views_are_finer(views, source):
         del images["normal"]
-    detail = 0.5 * _edge(source)
+    detail = 0.5 * _median_edge(source)
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
     visibilities = [
@@ -134,10 +134,10 @@ def _views_are_finer(views: Views, source: Source) -> bool:
 
     They can where a pixel spans at most 1.5 times the surface's median edge.
     """
-    return _view_pixel(views) <= 1.5 * _edge(source)
+    return _view_pixel(views) <= 1.5 * _median_edge(source)
 
 
-def _edge(source: Source) -> float:
+def _median_edge(source: Source) -> float:
     """Compute the median edge length of the source's triangles."""
     corners = source.mesh.vertices[source.mesh.faces]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
@@ -215,7 +215,9 @@ def from_scene(
     )
     texel = texture_detail(scene)
     # With vertex colors, or factors only, the mesh limits the detail.
-    detail = 0.5 * _edge(source) if texel is None else texel / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    detail = (
+        0.5 * _median_edge(source) if texel is None else texel / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    )
     width = footprint(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:

@@ -172,7 +172,7 @@ def bake(
 ) -> Baked:
     """Bake the values that `lookup` reads from the source into the texels.
 
-    reach (t,): how far from each triangle to look for the source (reproject.vertex_reach). progress(iterable, total,
+    reach (t,): how far from each triangle to look for the source (reproject.cage_offsets). progress(iterable, total,
     label) reports the parts done.
 
     The values are albedo, roughness, metallic, tangent_normal (n, 3), and everything else that lookup returns, except

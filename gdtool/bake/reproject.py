@@ -97,7 +97,7 @@ class Source:
                 self._facing[axis, sign] = Nearest(self.mesh, chosen) if len(chosen) else None
             return self._facing[axis, sign]
 
-    def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
+    def flip_if_inside_out(self, points: np.ndarray, normals: np.ndarray) -> bool:
         """Flip all face normals if the source is inside out, and return whether it was.
 
         It counts as inside out when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
@@ -129,7 +129,7 @@ class Places:
     from_behind: np.ndarray
 
 
-def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
+def cage_offsets(mesh: TriMesh, source: Source) -> np.ndarray:
     """Compute how far from each triangle to look for the source: (t,), the offset of its baking cage.
 
     This is twice the largest distance of the triangle's corners to the source, plus a share of its size for the bulge
@@ -227,7 +227,7 @@ def _nearest_agreeing(
     return face, point
 
 
-def _slide_off_edges(
+def _prefer_nearest_points(
     points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> None:
     """Replace a ray's hit by the nearest point, where the hit face is slanted and the two are far apart.
@@ -251,7 +251,7 @@ def _slide_off_edges(
     barycentric[slanted] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[nearest_face]])
 
 
-def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
+def _move_to_twins(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
     """Move places from faces with a twin (Source.twins) to the twin; changes face (n,) and barycentric (n, 3).
 
     places (k,): the rows of face and barycentric to move.
@@ -287,14 +287,14 @@ def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source
     )
     # Points behind a one-sided sheet, unless its other side coincides with it.
     behind = behind[np.isinf(distance[behind])]
-    _turn_over(source, behind, face, barycentric)
+    _move_to_twins(source, behind, face, barycentric)
     missed = np.flatnonzero(face < 0)
     if len(missed):
         face[missed], nearest = _nearest_agreeing(points[missed], normals[missed], reach[missed], source)
         barycentric[missed] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[face[missed]]])
     by_ray, from_behind = np.ones(len(points), bool), np.zeros(len(points), bool)
     by_ray[missed] = False
-    _slide_off_edges(points, normals, source, by_ray, face, barycentric)
+    _prefer_nearest_points(points, normals, source, by_ray, face, barycentric)
     for rows in (behind, missed):
         from_behind[rows] = dot(source.normals_of(face[rows]), normals[rows]) <= 0
     return Places(face, barycentric, by_ray, from_behind)

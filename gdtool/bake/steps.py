@@ -13,8 +13,8 @@ from gdtool.bake.maps import MapOptions, Maps, make_maps, require_map_memory
 from gdtool.bake.occlusion import bake_occlusion
 from gdtool.bake.origin import Origin
 from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
-from gdtool.bake.reproject import vertex_reach
-from gdtool.bake.target import Target, Texels, fineness, texel_width, texels_of
+from gdtool.bake.reproject import cage_offsets
+from gdtool.bake.target import Target, Texels, size_and_samples, texel_width, texels_of
 from gdtool.core.errors import InputError
 from gdtool.core.sources import Source
 from gdtool.core.stage import Output
@@ -29,10 +29,10 @@ Report = dict[str, bool | int | float | str]
 class StepOptions:
     """Options of a bake and of storing its maps.
 
-    size: side of the maps in texels; samples: per texel; None chooses either by the source's detail (target.fineness).
-    occlusion_rays: per traced point, with directions drawn from `seed`; 0 bakes no ambient occlusion. height,
-    confidence: whether to make these maps too. bits: 8 or 16 per channel. padding: width of gutters in texels; 0 fills
-    all free texels. normal_map: "auto" leaves a flat one out.
+    size: side of the maps in texels; samples: per texel; None chooses either by the source's detail
+    (target.size_and_samples). occlusion_rays: per traced point, with directions drawn from `seed`; 0 bakes no ambient
+    occlusion. height, confidence: whether to make these maps too. bits: 8 or 16 per channel. padding: width of gutters
+    in texels; 0 fills all free texels. normal_map: "auto" leaves a flat one out.
     """
 
     size: int | None
@@ -68,7 +68,7 @@ def rasterise(
 
     Returns texels and samples. Raises ResourceError for maps beyond the free memory, InputError without any texel.
     """
-    size, samples = fineness(target, origin.detail, options.size, options.samples)
+    size, samples = size_and_samples(target, origin.detail, options.size, options.samples)
     if options.samples is None and samples == 1:
         times = texel_width(target, size) / max(origin.detail, FINEST_DETAIL)
         out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one sample is enough")
@@ -88,7 +88,7 @@ def bake_maps(
     Returns the maps and the report's figures.
     """
     with out.step("bake"):
-        reach = vertex_reach(target.mesh, origin.source)
+        reach = cage_offsets(target.mesh, origin.source)
         bake_options = BakeOptions(samples, out.threads, options.height, options.confidence)
         baked = bake(target, texels, origin.source, origin.lookup, reach, bake_options, out.progress)
     occlusion = None

@@ -214,7 +214,7 @@ def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) 
     return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))
 
 
-def fineness(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
+def size_and_samples(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
     """Choose the side of the maps in texels, and the samples per texel where the source varies.
 
     detail: width of the source's finest detail, in the target's units. A size or number of samples that is not None is

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.bake.score import Seams
 from gdtool.bake.maps import make_maps
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
-from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets
 from gdtool.bake.target import Target, points_at, texels_of
 from gdtool.geometry.meshes import TriMesh
 from gdtool.images.color import srgb_from_linear
@@ -46,7 +46,7 @@ def stored():
         texels,
         source,
         vertex_lookup(source, attributes, fine_normals),
-        vertex_reach(TriMesh(coarse, faces), source),
+        cage_offsets(TriMesh(coarse, faces), source),
         BakeOptions(threads=2),
     )
     maps = make_maps(texels, baked.values)

@@ -6,7 +6,7 @@ import pytest
 from gdtool.bake.maps import make_maps
 from gdtool.bake.occlusion import ambient_visibility, bake_occlusion
 from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer, vertex_lookup
-from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
 from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.tangents import decode_tangent_space
@@ -37,7 +37,7 @@ def torus_bake():
     source = Source(TriMesh(fine, triangles_of(fine_quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
-    reach = vertex_reach(TriMesh(coarse, faces), source)
+    reach = cage_offsets(TriMesh(coarse, faces), source)
     return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, BakeOptions(threads=2))
 
 
@@ -107,7 +107,7 @@ def test_thin_wall_does_not_bleed_through():
         faces = np.concatenate([up, down])
         target = Target.of(TriMesh(low, faces), uv, faces)
         texels = texels_of(target, 64)
-        baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(low, faces), source))
+        baked = bake(target, texels, source, lookup, cage_offsets(TriMesh(low, faces), source))
         expected = np.where((texels.face_idx < 2)[:, None], [1.0, 0, 0], [0, 0, 1.0])
         np.testing.assert_allclose(baked.values["albedo"], expected, atol=1e-6)
 
@@ -135,7 +135,7 @@ def test_a_chart_smaller_than_a_texel_has_its_own_color():
         source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0)
     )
     texels = texels_of(target, 64)
-    baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(vertices, faces), source))
+    baked = bake(target, texels, source, lookup, cage_offsets(TriMesh(vertices, faces), source))
     image = make_maps(texels, baked.values).base_color
     assert rasterize_uv(uv, faces, 64)[0].max() == 1
     np.testing.assert_array_equal(image[19:23, 39:43], np.broadcast_to([0, 0, 255], (4, 4, 3)))

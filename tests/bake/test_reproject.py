@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gdtool.bake.reproject import Source, reproject, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets, reproject
 from gdtool.geometry.meshes import TriMesh
 from tests.bake.shapes import sphere, torus, triangles_of
 
@@ -65,7 +65,7 @@ def test_reach_covers_the_distance_but_not_the_object():
     vertices, quads, _ = torus(300, 150)
     coarse, coarse_quads, _ = torus(40, 20, minor=0.145)
     faces = triangles_of(coarse_quads)
-    reach = vertex_reach(TriMesh(coarse, faces), Source(TriMesh(vertices, triangles_of(quads))))
+    reach = cage_offsets(TriMesh(coarse, faces), Source(TriMesh(vertices, triangles_of(quads))))
     assert reach.min() > 0.005
     assert reach.max() < 0.08
 

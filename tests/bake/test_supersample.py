@@ -5,7 +5,7 @@ import pytest
 
 from gdtool.bake import supersample
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
-from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets
 from gdtool.bake.target import COARSE_TEXEL, Target, samples_for, texels_of
 from gdtool.geometry.meshes import TriMesh
 from gdtool.images.color import srgb_from_linear
@@ -44,7 +44,7 @@ def plate(material, left=4.0, right=28.0, samples=16, threads=1):
 
     texels = texels_of(target, SIZE)
     baked = bake(
-        target, texels, source, lookup, vertex_reach(TriMesh(vertices, faces), source), BakeOptions(samples, threads)
+        target, texels, source, lookup, cage_offsets(TriMesh(vertices, faces), source), BakeOptions(samples, threads)
     )
     return {name: texels.image(value) for name, value in baked.values.items()}
 
@@ -92,7 +92,7 @@ def ring():
         texels_of(target, 128),
         source,
         vertex_lookup(source, attributes, normals),
-        vertex_reach(TriMesh(coarse, faces), source),
+        cage_offsets(TriMesh(coarse, faces), source),
     )
 
 

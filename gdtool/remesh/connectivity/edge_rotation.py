@@ -68,7 +68,7 @@ class _RotatableMesh:
         self._face_of: dict[tuple[int, int], int] = {}  # the face that traverses an edge in this direction
         self._face_at = [0] * len(valence)  # one of the faces around each vertex
         for k in range(len(self.faces)):
-            self._enter(k)
+            self._register(k)
 
     def is_oriented(self) -> bool:
         """Return whether no two faces traverse an edge in the same direction."""
@@ -135,7 +135,7 @@ class _RotatableMesh:
         if not fewer and not neutral:
             return  # the other two corners gain no more than these lose
         first, second = self._face_of[p, q], self._face_of[q, p]
-        r, s, t, u = *self._after(first, q), *self._after(second, p)
+        r, s, t, u = *self._next_corners(first, q), *self._next_corners(second, p)
         for x, y in ((r, t), (s, u)):
             threes = (valence[x] < 4) + (valence[y] < 4)
             if not (
@@ -167,7 +167,7 @@ class _RotatableMesh:
         length = (x * x + y * y + z * z) ** 0.5 or 1.0
         return x / length, y / length, z / length
 
-    def _after(self, face: int, vertex: int) -> tuple[int, int]:
+    def _next_corners(self, face: int, vertex: int) -> tuple[int, int]:
         """Return the two corners that follow a vertex in a face."""
         corners = self.faces[face]
         i = corners.index(vertex)
@@ -188,12 +188,12 @@ class _RotatableMesh:
         del self._face_of[p, q], self._face_of[q, p]
         for face, quad in zip(rotation.faces, rotation.after, strict=True):
             self.faces[face] = quad
-            self._enter(face)
+            self._register(face)
         for edge, change in ((rotation.old, -1), (rotation.new, 1)):
             for vertex in edge:
                 self.valence[vertex] += change
 
-    def _enter(self, face: int) -> None:
+    def _register(self, face: int) -> None:
         """Register the directed edges of a face."""
         corners = self.faces[face]
         for i in range(4):

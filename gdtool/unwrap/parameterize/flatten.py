@@ -311,10 +311,10 @@ def overlaps_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: b
         return True
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     crossing, touches = rim_crossings(uv, edges.half_ends[rim])
-    return len(crossing) > 0 or (touches or not disk) and bool((_covered(uv, triangles)[2] > 1).any())
+    return len(crossing) > 0 or (touches or not disk) and bool((_rasterised(uv, triangles)[2] > 1).any())
 
 
-def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+def _rasterised(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
     """Rasterise a chart on a grid finer than its triangles.
 
     Returns uv (v, 2) scaled to the unit square, the grid's size, and (size, size) the number of triangles over each
@@ -337,7 +337,7 @@ def overlapping_triangles(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     edges = edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     overlaps[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])[0]]]] = True
-    at, size, count = _covered(uv, triangles)
+    at, size, count = _rasterised(uv, triangles)
     twice = count > 1
     if twice.any():
         for face_idx, row, column in owned_texels(at, triangles, size):

@@ -164,7 +164,7 @@ def _flatten_set(mesh: TriMesh, limits: FlattenLimits, is_merged: bool, project_
     return flatten(TriMesh(mesh.vertices, mesh.faces.astype(np.int64)), limits.good_stretch, max_stretch)
 
 
-def _excess(labelled: LabelledMesh, chart: Chart) -> float:
+def _stretch_excess(labelled: LabelledMesh, chart: Chart) -> float:
     """Compute a chart's area times the excess of its squared stretch over 1."""
     points = np.zeros((len(chart.uv), 3))
     used = chart.corners >= 0
@@ -182,7 +182,7 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
     """
     max_cut = _MAX_CUT + int(_MAX_CUT_SHARE * len(flat.charts))
     allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(labelled.adjacency.area.sum())
-    values = [_excess(labelled, chart) for chart in flat.charts]
+    values = [_stretch_excess(labelled, chart) for chart in flat.charts]
     total, gone = sum(values), set()
     queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(flat.charts[i].faces_idx) > 1]
     heapq.heapify(queue)
@@ -197,7 +197,7 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
             half for _, i in worst for half in _split_set(labelled.adjacency, labelled.part, flat.charts[i].faces_idx)
         ]
         halves = parameterize(labelled, sets, limits)
-        values = [_excess(labelled, chart) for chart in halves.charts]
+        values = [_stretch_excess(labelled, chart) for chart in halves.charts]
         total = rest + sum(values)
         for i, value in enumerate(values):
             if value > 0 and len(halves.charts[i].faces_idx) > 1:
