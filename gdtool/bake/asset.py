@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def material_of(
 ) -> Material:
     """Make a glTF material that uses the maps; every factor is written out, also where it has glTF's default."""
 
-    def texture(image: np.ndarray | None, encoding: str) -> Texture | None:
+    def texture(image: np.ndarray | None, encoding: Literal["srgb", "linear"]) -> Texture | None:
         """Make a texture that clamps, so that a chart at the map's edge does not read the opposite edge."""
         return None if image is None else Texture(image, encoding, wrap_u="clamp", wrap_v="clamp")
 
@@ -136,13 +137,13 @@ def write_obj(
 
     files: the file name of each map, by the map's name.
     """
-    library = path.with_suffix(".mtl")
+    library, (uv, face_uvs) = path.with_suffix(".mtl"), mesh.texture_coordinates()
     lines = [f"mtllib {library.name}", f"o {_object_name(name)}"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uv.tolist()]
+    lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in uv.tolist()]
     lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in corners.normals.tolist()]
     lines.append("usemtl material")
-    for face, uvs, ns in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), corners.idx.tolist(), strict=True):
+    for face, uvs, ns in zip(mesh.faces.tolist(), face_uvs.tolist(), corners.idx.tolist(), strict=True):
         lines.append(
             "f " + " ".join(f"{v + 1}/{t + 1}/{n + 1}" for v, t, n in zip(face, uvs, ns, strict=True) if v >= 0)
         )

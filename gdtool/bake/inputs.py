@@ -56,7 +56,7 @@ class SourceChoice:
 
 def path_of(source: Folder | Path | str) -> Path | str:
     """Return the path or name of a source, for messages."""
-    return getattr(source, "path", source)
+    return source.path if isinstance(source, Folder) else source
 
 
 def named_model(source: Folder | Path | str, model: str | None) -> str:

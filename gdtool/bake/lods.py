@@ -48,8 +48,9 @@ def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
     out, previous = Levels(), len(target.mesh.faces)
     # Each level is made by a child process: threads only wait for them.
     for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, threads), strict=True):
-        if level is not None and len(level.mesh.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
-            level, why = None, f"it cannot have fewer than {len(level.mesh.faces)} triangles without tearing a seam"
+        reached = 0 if level is None else len(level.mesh.faces)
+        if reached > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
+            level, why = None, f"it cannot have fewer than {reached} triangles without tearing a seam"
         if level is None:
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
@@ -58,12 +59,12 @@ def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
             why = f"its surface would drift on the maps by {100 * drifted['drift_mean']:.1f} % of the extent"
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
-        previous = len(level.mesh.faces)
+        previous = reached
         if previous > MAX_EXCESS * wanted:
             out.warnings.append(f"the level of {wanted} triangles has {previous}: fewer would tear a seam")
         out.targets.append(level)
         name = f"lod{len(out.targets)}"
-        out.report[f"{name}_triangles"] = len(level.mesh.faces)
+        out.report[f"{name}_triangles"] = reached
         out.report |= {f"{name}_{figure}": value for figure, value in drifted.items()}
     return out
 

@@ -86,7 +86,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
     """
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
-    domains = [d for d in ("albedo", "roughness", "metallic", "normal") if d in views.images]
+    domains: list[str] = [d for d in ("albedo", "roughness", "metallic", "normal") if d in views.images]
     encoded = {}
     for domain in domains:
         image = views.images[domain]

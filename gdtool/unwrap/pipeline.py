@@ -110,7 +110,8 @@ def unwrap(mesh: QuadMesh, request: Request) -> UnwrapResult:
     charts, failed = _flatten_in_child(unit, segmentation, request, deadlines)
     failed = segmentation.failed + failed
     gap = request.padding / request.size
-    orders, skipped = [], []
+    orders: list[PlacementOrder] = []
+    skipped: list[Skipped] = []
     if time.monotonic() < deadlines.packed:
         charts, orders, skipped = _cut_for_packing(adjacency(), charts, gap, deadlines.packed)
     placed, _ = pack([(chart.uv, chart.triangles) for chart in charts], gap, orders, deadlines.packed)
@@ -180,7 +181,7 @@ def _cut_for_packing(
         )
     if best.share > WELL_PACKED and len(tried) <= len(counts):
         skipped.append(Skipped("cutting further for packing", f"the charts fill {best.share:.0%} of the square", took))
-    return tried[best.index], best.orders, skipped
+    return tried[best.number], best.orders, skipped
 
 
 def figures(mesh: QuadMesh, size: int = 1024) -> dict[str, float | int]:

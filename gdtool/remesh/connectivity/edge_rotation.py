@@ -175,7 +175,8 @@ class _RotatableMesh:
 
     def _neighbours(self, vertex: int) -> list[int]:
         """Return the vertices at the other ends of an inner vertex's edges, in order around it."""
-        out, face = [], self._face_at[vertex]
+        out: list[int] = []
+        face = self._face_at[vertex]
         while not out or face != self._face_at[vertex]:
             corners = self.faces[face]
             out.append(corners[corners.index(vertex) - 1])

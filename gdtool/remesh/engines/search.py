@@ -60,7 +60,7 @@ class EngineAnswer(NamedTuple):
     """The number of quads requested from an engine, and the number that it returned."""
 
     requested: float
-    count: int
+    received: int
 
 
 def _interpolate_request(answers: list[EngineAnswer], wanted: float) -> float | None:
@@ -68,12 +68,12 @@ def _interpolate_request(answers: list[EngineAnswer], wanted: float) -> float | 
 
     Returns None unless there is an answer of each kind.
     """
-    fewer = [answer for answer in answers if answer.count < wanted]
-    more = [answer for answer in answers if answer.count > wanted]
+    fewer = [answer for answer in answers if answer.received < wanted]
+    more = [answer for answer in answers if answer.received > wanted]
     if not fewer or not more:
         return None
-    (low, below) = max(fewer, key=lambda answer: answer.count)
-    (high, above) = min(more, key=lambda answer: answer.count)
+    (low, below) = max(fewer, key=lambda answer: answer.received)
+    (high, above) = min(more, key=lambda answer: answer.received)
     return low + (high - low) * (wanted - below) / (above - below)
 
 
@@ -140,7 +140,8 @@ class EngineSearch:
                 and len(best.mesh.faces)
                 and (missing := best.missing_surface(self.patch))
             ):
-                return self._fail(attempt, missing)
+                self._fail(attempt, missing)
+                return None
             if not has_count and (usable or is_together):
                 if turn and count * _MAX_GROWTH < wanted:
                     break  # small pieces are lost however many quads are requested
@@ -156,11 +157,13 @@ class EngineSearch:
             if has_count and best.is_bridged and not attempt.subdivisions:
                 self._bridged = best
             if not usable:
-                return self._fail(attempt, best.fault, torn=best.count_error(wanted) < -_MAX_TORN_SHARE)
+                self._fail(attempt, best.fault, torn=best.count_error(wanted) < -_MAX_TORN_SHARE)
+                return None
             in_order = self._fit_order(attempt, candidates, wanted)
             taken = self._fit_first_good(self._with_right_count(in_order, tip_quads))
             if taken is not None and taken.rejection is not None:
-                return self._reject(taken)
+                self._reject(taken)
+                return None
             if taken is None:  # the first was snapped, and does not have the count together with its tips
                 taken, count = in_order[0], in_order[0].snapped_count
             else:

@@ -188,15 +188,15 @@ def pair_and_split(mesh: TriMesh, quads: int) -> QuadMesh:
     # Each pair spares two quads: two triangles give three each, a pair gives four.
     wanted_pairs = max((3 * len(faces) - quads + 1) // 2, 0)
     is_single = np.ones(len(faces), bool)
-    chosen = []
+    chosen_pairs: list[int] = []
     for i in np.flatnonzero(usable)[np.argsort(cosine[usable] + (1 - bend[usable]), kind="stable")].tolist():
-        if len(chosen) >= wanted_pairs:
+        if len(chosen_pairs) >= wanted_pairs:
             break
         f, g = pairs[i]
         if is_single[f] and is_single[g]:
             is_single[f] = is_single[g] = False
-            chosen.append(i)
-    chosen = np.array(chosen, np.int64)
+            chosen_pairs.append(i)
+    chosen = np.array(chosen_pairs, np.int64)
     mixed = np.full((int(is_single.sum()) + len(chosen), 4), -1, np.int64)
     mixed[: int(is_single.sum()), :3] = faces[is_single]
     if len(chosen):

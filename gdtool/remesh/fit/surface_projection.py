@@ -244,20 +244,23 @@ def fill_holes(mesh: QuadMesh, longest: int = 64) -> QuadMesh:
     starts: dict[int, list[int]] = {}
     for k, vertex in enumerate(half[:, 0].tolist()):
         starts.setdefault(vertex, []).append(k)
-    following = []
+    following: list[int | None] = []
     for k, vertex in enumerate(half[:, 1].tolist()):
         choices = starts.get(vertex, [])
         if len(choices) == 2:  # a hole's boundary arrives on one of the two fans and leaves on the other
             choices = [on for on in choices if leaving[on] != arriving[k]]
         following.append(choices[0] if len(choices) == 1 else None)  # where more holes meet, the way is ambiguous
-    new_points, new_faces, seen = [], [], set()
+    new_points: list[np.ndarray] = []
+    new_faces: list[list[int]] = []
+    seen: set[int] = set()
     for start in range(len(half)):
-        loop, k = [], start
-        while k is not None and k not in seen and len(loop) <= longest:
-            seen.add(k)
-            loop.append(int(half[k, 0]))
-            k = following[k]
-        if k != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
+        loop: list[int] = []
+        half_edge: int | None = start
+        while half_edge is not None and half_edge not in seen and len(loop) <= longest:
+            seen.add(half_edge)
+            loop.append(int(half[half_edge, 0]))
+            half_edge = following[half_edge]
+        if half_edge != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
             continue
         loop = loop[::-1]  # the new faces traverse the edges in the opposite direction
         if len(loop) == 4:

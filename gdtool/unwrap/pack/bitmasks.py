@@ -202,7 +202,7 @@ class ChartMasks:
         """
         stride = self.stride
         touching = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
-        windows = {}, {}
+        windows: tuple[dict[int, int], dict[int, int]] = {}, {}
         best = None
         for turn in self._turns[i]:
             h, w = self.shapes[i][turn]

@@ -60,11 +60,11 @@ class Layout(NamedTuple):
 class BestCut(NamedTuple):
     """The set of charts that packs best, of several that each cut the surface further.
 
-    index: its number; share: of the square that it fills, 0 (with index 0) where no set could be packed; orders: the
-    best orders to pack it in; skipped: the number of sets that were passed over.
+    number: which of the sets, from 0 on. share: of the square that the set fills; 0 (with number 0) where no set could
+    be packed. orders: the best orders to pack it in. skipped: the number of sets that were passed over.
     """
 
-    index: int
+    number: int
     share: float
     orders: list[PlacementOrder]
     skipped: int
@@ -272,7 +272,8 @@ def _place_in_order(
     contact. caches_meetings: whether charts are placed so often that it pays to cache where two of them overlap.
     Returns None where the square would grow too large, or the time is over.
     """
-    taken, at, others = 0, [Placement(0, 0, 0)] * len(order.order), []
+    taken, at = 0, [Placement(0, 0, 0)] * len(order.order)
+    others: list[tuple[int, Placement]] = []
     border, after = masks.border(side), {} if known is None else known
     for i in order.order:
         neighbours = others if caches_meetings else None

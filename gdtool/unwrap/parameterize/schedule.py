@@ -183,12 +183,14 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
     max_cut = _MAX_CUT + int(_MAX_CUT_SHARE * len(flat.charts))
     allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(labelled.adjacency.area.sum())
     values = [_stretch_excess(labelled, chart) for chart in flat.charts]
-    total, gone = sum(values), set()
+    total = sum(values)
+    gone: set[int] = set()
     queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(flat.charts[i].faces_idx) > 1]
     heapq.heapify(queue)
     while total > allowed and len(gone) < max_cut and queue:
         # Cut at once all charts that have to be cut even if the parts of the worse ones do not stretch at all.
-        worst, rest = [], total
+        worst: list[tuple[float, int]] = []
+        rest = total
         while rest > allowed and len(gone) + len(worst) < max_cut and queue:
             worst.append(heapq.heappop(queue))
             rest += worst[-1][0]

@@ -31,7 +31,8 @@ def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) ->
     """
     total = float(adjacency.area.sum())
     number = itertools.count()  # of equal cuts the earlier comes first
-    whole, queue = [], []
+    whole: list[Chart] = []
+    queue: list[tuple[float, int, _CutCandidate]] = []
 
     def add(piece: _CutCandidate) -> None:
         if piece.rate < _MIN_GAIN * total:
@@ -44,7 +45,9 @@ def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) ->
     for count in counts:
         changed = False
         while queue and len(whole) + len(queue) < count:
-            for part in heapq.heappop(queue)[2].cut[1]:
+            best = heapq.heappop(queue)[2].cut
+            assert best is not None  # without a cut a piece gains nothing, and is not in the queue
+            for part in best[1]:
                 add(part)
             changed = True
         if changed:
@@ -61,10 +64,10 @@ class _CutCandidate:
     def cut(self) -> tuple[float, list[_CutCandidate]] | None:
         """Find the best cut: the area that rectangles lose by it, and its two or three parts; None without a cut."""
         best = _best_cut(self._adjacency, self.chart, self._smallest)
-        return best and (
-            best[0],
-            [_CutCandidate(self._adjacency, sub_chart(self.chart, half), self._smallest) for half in best[1]],
-        )
+        if best is None:
+            return None
+        area, halves = best
+        return area, [_CutCandidate(self._adjacency, sub_chart(self.chart, half), self._smallest) for half in halves]
 
     @cached_property
     def rate(self) -> float:
