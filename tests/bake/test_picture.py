@@ -18,7 +18,7 @@ from tests.stages.bake_folders import torus_views
 FINE, COARSE = 256, 64
 
 
-def shown(painted: np.ndarray, light: np.ndarray):
+def view_and_picture(painted: np.ndarray, light: np.ndarray):
     """Make the albedo of a view (COARSE) and the picture (FINE, RGBA) of a disc that is painted and lit.
 
     Also returns the disc's mask (FINE, FINE).
@@ -41,7 +41,7 @@ def camera():
 def test_paint_is_recovered_under_smooth_light(camera):
     y, x = np.mgrid[:FINE, :FINE]
     painted = np.stack([0.2 + 0.6 * ((x // 9 + y // 9) % 2), 0.3 + 0.3 * ((x // 5) % 2), 0.5 + 0 * x], -1)
-    albedo, picture, disc = shown(painted, 0.4 + 0.5 * x / FINE)
+    albedo, picture, disc = view_and_picture(painted, 0.4 + 0.5 * x / FINE)
     coarse = resized(albedo, FINE, FINE)
     sharp = coarse * picture_of(picture, camera, albedo).factor
     inside = resized(resized(disc * 1.0, COARSE, COARSE), FINE, FINE) > 0.99
@@ -51,12 +51,14 @@ def test_paint_is_recovered_under_smooth_light(camera):
 def test_hard_shadows_on_one_color_are_no_paint(camera):
     y, x = np.mgrid[:FINE, :FINE]
     light = np.where((x + y) % 40 < 12, 0.3, 0.9)
-    albedo, picture, _ = shown(np.full((FINE, FINE, 3), 0.5), light)
+    albedo, picture, _ = view_and_picture(np.full((FINE, FINE, 3), 0.5), light)
     np.testing.assert_allclose(picture_of(picture, camera, albedo).factor, 1, atol=1e-3)
 
 
 def test_a_picture_no_finer_than_its_view_adds_nothing(camera):
-    albedo, picture, _ = shown(np.random.default_rng(0).uniform(0.2, 0.8, (FINE, FINE, 3)), np.ones((FINE, FINE)))
+    albedo, picture, _ = view_and_picture(
+        np.random.default_rng(0).uniform(0.2, 0.8, (FINE, FINE, 3)), np.ones((FINE, FINE))
+    )
     small = resized(picture, COARSE, COARSE)
     np.testing.assert_allclose(picture_of(small, camera, albedo).factor, 1, atol=1e-5)
 
@@ -65,7 +67,7 @@ def test_points_read_the_pixels_that_show_them(camera):
     rng = np.random.default_rng(1)
     points = rng.uniform(-0.3, 0.3, (50, 3))
     ramp = np.stack(np.broadcast_arrays(*np.meshgrid(np.arange(FINE) + 0.5, np.arange(FINE) + 0.5), 1.0), -1)
-    albedo, picture, _ = shown(np.full((FINE, FINE, 3), 0.5), np.ones((FINE, FINE)))
+    albedo, picture, _ = view_and_picture(np.full((FINE, FINE, 3), 0.5), np.ones((FINE, FINE)))
     factors = replace(picture_of(picture, camera, albedo), factor=ramp.astype(np.float32)).at(points)
     np.testing.assert_allclose(factors[:, :2], project(camera, points)[0] * FINE / COARSE, atol=1e-3)
 

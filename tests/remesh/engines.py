@@ -10,7 +10,7 @@ from gdtool.remesh.engines import candidate as candidates
 from gdtool.remesh.engines import search
 
 
-def whole(faces) -> bool:
+def is_watertight_manifold(faces) -> bool:
     """Return whether all faces are quads, watertight and manifold."""
     return faces.min() >= 0 and topology.is_watertight(faces) and topology.is_manifold(faces)
 

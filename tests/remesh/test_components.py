@@ -13,7 +13,7 @@ from gdtool.remesh.fit.feature_curves import Constraints
 from gdtool.remesh.fit.shaping import FittedQuads
 from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, sphere
-from tests.remesh.engines import in_this_process, whole
+from tests.remesh.engines import in_this_process, is_watertight_manifold
 
 
 def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
@@ -44,7 +44,7 @@ def test_pieces_that_an_engine_loses_are_remeshed_one_by_one(monkeypatch):
     quads_out = made.faces
     assert tried == [2, 1, 1]
     assert topology.components(quads_out)[0] == 2
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
 
 
@@ -68,7 +68,7 @@ def test_good_pieces_of_an_engines_result_are_kept(monkeypatch, hopeless):
     out, quads_out = made.vertices, made.faces
     assert record.engine == ("instant-meshes; pair and split" if hopeless else "instant-meshes")
     assert topology.components(quads_out)[0] == 21
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     small = quads_out[(out[quads_out][..., 2] < 0.15).all(1)]
     # An engine's ball of a hundred quads has eight irregular vertices; paired triangles have a fifth or more.
@@ -104,7 +104,7 @@ def test_small_piece_is_not_lost():
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000))
     out, quads_out = made.vertices, made.faces
     assert topology.components(quads_out)[0] == 2
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert "pair and split" in record.engine
     assert np.linalg.norm(out - 0.45, axis=1).min() < 0.05
 
@@ -122,7 +122,7 @@ def test_tiny_pieces_skip_engines(monkeypatch):
     assert tried == [1]
     assert "engines: not tried, 20 pieces of so few quads" in record.failed
     assert topology.components(quads_out)[0] == 21
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
 
 

@@ -16,7 +16,7 @@ from gdtool.remesh.fit.feature_curves import NO_FEATURES
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
 from gdtool.remesh.task import RemeshPatch, Request
 from tests.geometry.solids import cube, joined, rod, sphere, torus, volume
-from tests.remesh.engines import whole
+from tests.remesh.engines import is_watertight_manifold
 
 
 def test_pairing_gives_the_requested_count_exactly():
@@ -25,7 +25,7 @@ def test_pairing_gives_the_requested_count_exactly():
         made = pair_and_split(TriMesh(vertices, faces), count)
         out, quads_out = made.vertices, made.faces
         assert abs(len(quads_out) - count) <= 1
-        assert whole(quads_out)
+        assert is_watertight_manifold(quads_out)
         assert volume(out, quads_out) > 0
 
 
@@ -114,7 +114,7 @@ def test_splitting_makes_square_quads_of_any_triangles(shape):
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000, engine="split"))
     out, quads_out = made.vertices, made.faces
     assert record.engine == "pair and split"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 3000 - 1) <= 0.03
     assert topology.components(quads_out)[0] == topology.components(faces)[0]
     figures = shape_figures(QuadMesh(out, quads_out))

@@ -20,7 +20,7 @@ from gdtool.remesh.fit.shaping import SnappedQuads, rejection_reason, target_of_
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
 from gdtool.remesh.task import Record, RemeshPatch, Request
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
-from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
+from tests.remesh.engines import Ended, around, in_this_process, inner_face, is_watertight_manifold
 
 
 @pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
@@ -31,7 +31,7 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
     quads_out = made.faces
     assert record.engine == "pair and split"
     assert any(failure in text for text in record.failed)
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 900 - 1) <= 0.03
 
 
@@ -66,7 +66,7 @@ def test_an_engine_far_from_the_surface_runs_once_and_a_crashing_one_again(monke
     quads_out = made.faces
     assert len(calls) == runs
     assert record.engine == "pair and split"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
@@ -148,7 +148,7 @@ def test_subdivision_is_given_up_where_walls_are_thinner_than_quads(thickness, t
     # No creases, since the plate's narrow sides would count as narrow strips.
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, crease_degrees=0.0))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert any("walls" in text for text in record.failed) == thin
     assert not (thin and "1 subdivision" in record.engine)
 
@@ -180,7 +180,7 @@ def test_only_handles_finer_than_a_quad_may_be_lost(monkeypatch, shape, given_up
     in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that returns a ball
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert (record.engine == "instant-meshes, handles are lost") == given_up
     assert topology.euler_number(quads_out) == (2 if given_up else 0)
 
@@ -192,7 +192,7 @@ def test_torn_output_is_rejected(monkeypatch):
     vertices, faces = sphere(24)
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=300))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert record.engine == "pair and split"
     assert any("pieces are lost" in text for text in record.failed)
 
@@ -207,7 +207,7 @@ def test_a_hole_with_a_quad_attached_by_one_corner_is_closed():
     fault, mended = candidates.repair_and_judge(QuadMesh(vertices, torn), topology.invariants(faces))
     out, quads_out = mended.vertices, mended.faces
     assert fault is None
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert topology.components(quads_out)[0] == 1
     assert len(quads_out) < len(faces)
     assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
@@ -293,7 +293,7 @@ def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
     quads_out = made.faces
     assert record.engine == "instant-meshes, 1 subdivision"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0]
     assert "SIGSEGV" in record.failed[1]
@@ -315,7 +315,7 @@ def test_no_engine_is_started_when_the_time_is_over():
     quads_out = made.faces
     assert record.engine == "pair and split"
     assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert time.monotonic() - start < 30
 
@@ -428,7 +428,7 @@ def test_subdivision_is_not_tried_where_creases_are_closer_than_a_quad(monkeypat
     assert all(not attempt.subdivisions for _, attempt, _ in calls)
     assert "not tried, its quads are wider" in record.failed[0]
     assert record.engine == "instant-meshes"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
     assert uncovered_shares(
@@ -452,4 +452,4 @@ def test_an_engine_has_its_own_memory_limit_within_the_requests(monkeypatch, mem
     assert limits
     assert all(least <= limit <= most for limit in limits)
     assert record.engine == "pair and split"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
