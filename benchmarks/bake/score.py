@@ -54,7 +54,7 @@ class Truth:
             texels, target = texels_of(self.target, size, rings=0), self.target
             chosen = np.sort(np.random.default_rng(0).choice(texels.inside, min(CHOSEN, texels.inside), replace=False))
             face_idx, barycentric = texels.face_idx[chosen], texels.barycentric[chosen].astype(np.float64)
-            points = np.einsum("nk,nkc->nc", barycentric, target.vertices[target.faces[face_idx]])
+            points = np.einsum("nk,nkc->nc", barycentric, target.mesh.vertices[target.mesh.faces[face_idx]])
             read = self.material(points)
             # Models whose winding and normals disagree are common: outside is where the mesh that is baked has it.
             side = np.where((read["normal"] * target.normals[face_idx].mean(1)).sum(1) < 0, -1.0, 1.0)
@@ -119,7 +119,7 @@ class Seams:
         from gdtool.geometry.tangents import edge_pairs
 
         target, rng = truth.target, np.random.default_rng(1)
-        one, two = edge_pairs(target.faces)
+        one, two = edge_pairs(target.mesh.faces)
         start = [target.uv[target.face_uvs[half // 3, half % 3]] for half in (one, two)]
         end = [target.uv[target.face_uvs[half // 3, (half % 3 + 1) % 3]] for half in (one, two)]
         seam = (np.abs(start[0] - end[1]).max(1) > 1e-9) | (np.abs(end[0] - start[1]).max(1) > 1e-9)
@@ -163,7 +163,7 @@ def _beside(target, half: np.ndarray, along: np.ndarray, width: float) -> tuple[
     """Texture coordinates (n, 2) and positions (n, 3) `width` inside the triangles of half-edges (n,), `along` (n,) the
     edge."""
     face, k = half // 3, half % 3
-    corners = target.vertices[target.faces[face]]
+    corners = target.mesh.vertices[target.mesh.faces[face]]
     at = np.arange(len(face))
     a, b, c = (corners[at, (k + i) % 3] for i in range(3))
     length = np.maximum(np.linalg.norm(b - a, axis=1), 1e-12)

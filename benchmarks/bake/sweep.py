@@ -29,7 +29,6 @@ from benchmarks.common.fine_meshes import models_in
 from benchmarks.common.measure import ROOT, busy, machine, number, peak_mb, say, table
 from benchmarks.common.resumable_rows import Rows
 from benchmarks.common.wireframe import file_name
-from gdtool.geometry.meshes import TriMesh
 
 PEER = Path(__file__).with_name("in_blender.py")
 COLUMNS = (
@@ -92,7 +91,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     from gdtool.bake.occlusion import bake_occlusion
     from gdtool.bake.origin import from_scene
     from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
-    from gdtool.bake.reproject import vertex_reach
+    from gdtool.bake.reproject import cage_offsets
     from gdtool.bake.target import samples_for, texel_width, texels_of
     from gdtool.images.io import encode_pngs
 
@@ -103,7 +102,7 @@ def ours(case: Case, size: int, occlusion: bool, out: str) -> dict[str, float]:
     origin = from_scene(scene, np.eye(4), lambda detail: 0.5 * width / samples_for(width, detail) ** 0.5)
     cost, clock = {}, Clock()
     texels = texels_of(target, size, threads=threads)
-    reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
+    reach = cage_offsets(target.mesh, origin.source)
     baked = bake(
         target, texels, origin.source, origin.lookup, reach, BakeOptions(samples_for(width, origin.detail), threads)
     )

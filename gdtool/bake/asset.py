@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.bake.maps import Maps
 from gdtool.bake.target import CornerNormals, SurfaceModes, Target
 from gdtool.geometry.frames import transform_points
-from gdtool.geometry.meshes import QuadMesh
+from gdtool.geometry.meshes import QuadMesh, TriMesh
 from gdtool.geometry.tangents import number_distinct_rows
 
 
@@ -20,8 +21,8 @@ from gdtool.geometry.tangents import number_distinct_rows
 class AssetMeshes:
     """The meshes of an asset.
 
-    target: the triangles that were baked. mesh: the quads they came from. face_idx (t,): the quad of each triangle.
-    levels: coarser levels of detail, finest first.
+    target: the triangles that were baked. mesh: the quads that were cut into these triangles. face_idx (t,): the quad
+    of each triangle. levels: coarser levels of detail, finest first.
     """
 
     target: Target
@@ -32,10 +33,10 @@ class AssetMeshes:
 
 @dataclass(frozen=True)
 class AssetOptions:
-    """How to write an asset.
+    """Options for writing an asset's files.
 
-    name: of the object. convention: "opengl" or "directx", the green channel of normal.png. usd: file name of the
-    OpenUSD file; empty for none. threads: of the PNG encoder.
+    name: the object's name. convention: "opengl" or "directx", the direction of the green channel of normal.png. usd:
+    file name of the OpenUSD file; empty to write none. threads: the number that the PNG encoder uses.
     """
 
     name: str
@@ -45,7 +46,10 @@ class AssetOptions:
 
 
 def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
-    """Move meshes from the normalised frame to the source's by a similarity (4, 4): vertices, normals and tangents."""
+    """Transform meshes from the normalised frame to the source's by a similarity (4, 4).
+
+    Vertices, normals and tangents are transformed, those of the levels of detail too.
+    """
     turn = matrix[:3, :3] / (matrix[:3, 0] ** 2).sum() ** 0.5
 
     def moved(target: Target) -> Target:
@@ -53,22 +57,22 @@ def in_source_frame(meshes: AssetMeshes, matrix: np.ndarray) -> AssetMeshes:
         tangents[..., :3] = tangents[..., :3] @ turn.T
         return replace(
             target,
-            vertices=transform_points(matrix, target.vertices),
+            mesh=TriMesh(transform_points(matrix, target.mesh.vertices), target.mesh.faces),
             normals=target.normals @ turn.T,
             tangents=tangents,
         )
 
     target = moved(meshes.target)
-    mesh = replace(meshes.mesh, vertices=target.vertices)
+    mesh = replace(meshes.mesh, vertices=target.mesh.vertices)
     return AssetMeshes(target, mesh, meshes.face_idx, tuple(moved(level) for level in meshes.levels))
 
 
 def material_of(
     maps: Maps, name: str, alpha_mode: str = "OPAQUE", alpha_cutoff: float = 0.5, double_sided: bool = False
 ) -> Material:
-    """Make the glTF material of maps; every factor is explicit."""
+    """Make a glTF material that uses the maps; every factor is written out, also where it has glTF's default."""
 
-    def texture(image: np.ndarray | None, encoding: str) -> Texture | None:
+    def texture(image: np.ndarray | None, encoding: Literal["srgb", "linear"]) -> Texture | None:
         """Make a texture that clamps, so that a chart at the map's edge does not read the opposite edge."""
         return None if image is None else Texture(image, encoding, wrap_u="clamp", wrap_v="clamp")
 
@@ -91,12 +95,13 @@ def material_of(
 
 
 def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene:
-    """Make a scene of the target's triangles. Corners that agree in everything become one vertex.
+    """Make a scene of the target's triangles.
 
-    Tangents are written only where a normal map needs them.
+    Corners with equal position, texture coordinates and normal (and tangent, where there is a normal map) share a
+    vertex. Tangents are written only where there is a normal map.
     """
-    corner = np.arange(len(target.faces) * 3)
-    position_idx, uv_idx = target.faces.ravel(), target.face_uvs.ravel()
+    corner = np.arange(len(target.mesh.faces) * 3)
+    position_idx, uv_idx = target.mesh.faces.ravel(), target.face_uvs.ravel()
     normals, tangents = target.normals.reshape(-1, 3), target.tangents.reshape(-1, 4)
     columns = [position_idx[:, None], uv_idx[:, None], normals]
     if maps.normal is not None:
@@ -108,14 +113,14 @@ def scene_of(target: Target, maps: Maps, material: Material, name: str) -> Scene
     order = np.argsort(first, kind="stable")
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
-    kept = first[order]
+    corner_of_vertex = first[order]
     return Scene(
-        vertices=target.vertices[position_idx[kept]],
+        vertices=target.mesh.vertices[position_idx[corner_of_vertex]],
         faces=place[vertex].reshape(-1, 3).astype(np.int32),
         materials=(material,),
-        normals=normals[kept],
-        tangents=tangents[kept] if maps.normal is not None else None,
-        uvs=(np.asarray(target.uv, np.float64)[uv_idx[kept]],),
+        normals=normals[corner_of_vertex],
+        tangents=tangents[corner_of_vertex] if maps.normal is not None else None,
+        uvs=(np.asarray(target.uv, np.float64)[uv_idx[corner_of_vertex]],),
         name=name,
     )
 
@@ -128,14 +133,17 @@ def write_obj(
     files: dict[str, str],
     name: str,
 ) -> None:
-    """Write the quads as an .obj, and its .mtl beside it under the same name; files: file name by map name."""
-    library = path.with_suffix(".mtl")
-    lines = [f"mtllib {library.name}", f"o {_word(name)}"]
+    """Write the quads as an .obj, and its .mtl beside it under the same stem.
+
+    files: the file name of each map, by the map's name.
+    """
+    library, (uv, face_uvs) = path.with_suffix(".mtl"), mesh.texture_coordinates()
+    lines = [f"mtllib {library.name}", f"o {_object_name(name)}"]
     lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
-    lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in mesh.uv.tolist()]
+    lines += [f"vt {u:.9g} {1 - v:.9g}" for u, v in uv.tolist()]
     lines += [f"vn {x:.6g} {y:.6g} {z:.6g}" for x, y, z in corners.normals.tolist()]
     lines.append("usemtl material")
-    for face, uvs, ns in zip(mesh.faces.tolist(), mesh.face_uvs.tolist(), corners.idx.tolist(), strict=True):
+    for face, uvs, ns in zip(mesh.faces.tolist(), face_uvs.tolist(), corners.idx.tolist(), strict=True):
         lines.append(
             "f " + " ".join(f"{v + 1}/{t + 1}/{n + 1}" for v, t, n in zip(face, uvs, ns, strict=True) if v >= 0)
         )
@@ -143,16 +151,17 @@ def write_obj(
     library.write_text(material_library(maps, files))
 
 
-def _word(name: str) -> str:
-    """Replace what an .obj object name cannot hold by underscores."""
+def _object_name(name: str) -> str:
+    """Replace the characters that an .obj object name cannot contain by underscores."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name) or "object"
 
 
 def material_library(maps: Maps, files: dict[str, str]) -> str:
-    """Compose the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) that newer readers know.
+    """Compose the text of the .mtl: the classic fields, and the physically based ones (Pr, Pm, norm) of newer readers.
 
     The normal map is named twice: Blender's importer ignores norm, and takes map_Bump for a normal map of strength -bm.
-    Roughness and metallic are channels of the packed map, chosen by -imfchan (Wavefront MTL 4.2).
+    Roughness and metallic are channels of the packed map, chosen by -imfchan (Wavefront MTL 4.2). files: the file name
+    of each map, by the map's name.
     """
     r, g, b, a = maps.factors["base_color"]
     lines = [
@@ -197,10 +206,10 @@ def corner_normals_of_quads(meshes: AssetMeshes) -> CornerNormals:
 def write_models(
     path: Callable[[str], Path], meshes: AssetMeshes, maps: Maps, surface: SurfaceModes, options: AssetOptions
 ) -> dict[str, str]:
-    """Write asset.glb, asset.obj, the maps, asset_lod1.glb and on, and OpenUSD where asked for.
+    """Write the asset's models and maps: asset.glb, asset.obj, PNG files, levels of detail and, if asked for, OpenUSD.
 
-    path(file name) says where. The coarser levels refer to the maps' files instead of holding them. Returns the file
-    name of each map.
+    path: returns where to write a file, from its name. Levels are written as asset_lod1.glb, asset_lod2.glb …, which
+    refer to the PNG files instead of containing them. Returns the file name of each map, by the map's name.
     """
     from gdtool.assets.gltf.write import write_glb
     from gdtool.bake.maps import contact_sheet_of
@@ -241,10 +250,10 @@ def _write_maps(
     convention: str,
     has_levels: bool,
 ) -> dict[int, str]:
-    """Write the maps that the material refers to; returns the file name, by id of the image, that a glTF may refer to.
+    """Write the material's maps as PNG files; return the file name for glTF to refer to, by the id() of each image.
 
-    With the directx convention, normal.png has its green channel inverted. glTF knows opengl only: so the coarser
-    levels refer to normal_opengl.png.
+    With the "directx" convention, normal.png has its green channel inverted. glTF knows "opengl" only, so where there
+    are levels of detail, normal_opengl.png is written for them as well.
     """
     from gdtool.bake.maps import directx
     from gdtool.images.io import write_png

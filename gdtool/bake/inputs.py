@@ -1,4 +1,4 @@
-"""Read what a bake is given: the mesh to bake for, and the surface or model to bake from."""
+"""Read the inputs of a bake: the mesh to bake for, and the surface or model to bake from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from gdtool.bake.origin import Origin, from_scene, from_surface, material_field
 from gdtool.bake.picture import Picture, picture_of
-from gdtool.bake.target import Target, fineness, texel_width
+from gdtool.bake.target import Target, size_and_samples, texel_width
 from gdtool.core.errors import InputError
 from gdtool.core.folder import Folder
 from gdtool.folders.mesh import read_mesh, read_obj
@@ -21,14 +21,14 @@ from gdtool.geometry.meshes import QuadMesh, TriMesh
 # A mesh file is taken to be in the normalised frame when its bounding box is centred to this distance, and its longest
 # side is 1 to this difference.
 NORMALISED_OFFSET, NORMALISED_SCALE = 0.02, 0.05
-# Texture coordinates beyond this are damaged: no one tiles so often.
+# Larger texture coordinates are taken to be damaged: textures are not repeated this often.
 MAX_UV = 64
 # The least share of doubly covered texels, of those covered, that is worth a warning.
 OVERLAP_SHARE = 0.001
 # Side in texels of the image in which overlaps are counted.
 OVERLAP_SIZE = 512
 
-# About how many triangles tell whether a source is inside out.
+# Triangles of the target, about, that are compared with the source to find whether it is inside out.
 MOST_COMPARED = 5000
 
 MATERIALS = ("albedo", "roughness", "metallic")
@@ -36,11 +36,12 @@ MATERIALS = ("albedo", "roughness", "metallic")
 
 @dataclass
 class SourceChoice:
-    """What to bake from.
+    """The choice of a source to bake from.
 
-    surface, views: folders, where there are any. model: a model file or procedural:SEED that replaces the surface.
-    project_views: whether to read the views. size, samples: of the maps, where they are given (see target.fineness).
-    device: where networks run. skipped: filled with what was left out, and why.
+    surface, views: folders, None where there are none. model: a model file or procedural:SEED that replaces the
+    surface. project_views: whether to read the views. size: side of the maps in texels; samples: samples per texel;
+    None chooses either by the source's detail (target.size_and_samples). device: the torch device for networks.
+    skipped: (what, why) of each input that was left out; reading appends to it.
     """
 
     surface: Folder | None
@@ -54,12 +55,12 @@ class SourceChoice:
 
 
 def path_of(source: Folder | Path | str) -> Path | str:
-    """Return the path that messages name a source by."""
-    return getattr(source, "path", source)
+    """Return the path or name of a source, for messages."""
+    return source.path if isinstance(source, Folder) else source
 
 
 def named_model(source: Folder | Path | str, model: str | None) -> str:
-    """Return the model to bake from: the given one, else the one that the mesh folder was remeshed from.
+    """Return the model to bake from: `model`, or without it the one that the mesh folder was remeshed from.
 
     Raises InputError where there is neither.
     """
@@ -82,9 +83,9 @@ def named_model(source: Folder | Path | str, model: str | None) -> str:
 def read_target_mesh(source: Folder | Path | str, surface: Folder | None) -> tuple[QuadMesh, np.ndarray]:
     """Read the mesh to bake for, in the normalised frame, and the matrix (4, 4) from there to its source's frame.
 
-    surface is what it is baked from, None for a model. A mesh file may be in either frame. One that fills the unit box
-    is taken to be normalised, like the surface; any other to be in the source's frame. Raises InputError for a mesh
-    without usable texture coordinates.
+    surface: the folder that is baked from, None for a model. A mesh file may be in either frame. If it fills the unit
+    box, it is taken to be normalised, like the surface; otherwise it is taken to be in the source's frame. Raises
+    InputError for a mesh without usable texture coordinates.
     """
     in_folder = hasattr(source, "content")
     if in_folder:
@@ -121,7 +122,7 @@ def _triangles_of_scene(path: Path) -> QuadMesh:
 
 
 def target_of(mesh: QuadMesh) -> tuple[Target, np.ndarray]:
-    """Cut quads into the triangles to bake into; also returns the quad (t,) that each comes from."""
+    """Cut a mesh of quads into the triangles to bake into; return them and the quad (t,) of each triangle."""
     uv, quad_uvs = mesh.texture_coordinates()
     faces, face_idx = mesh.triangulation
     # The texture corners are cut the same way: the second triangle of a quad has its corners 0, 2, 3.
@@ -133,7 +134,7 @@ def target_of(mesh: QuadMesh) -> tuple[Target, np.ndarray]:
 
 
 def uv_warnings(target: Target) -> list[str]:
-    """Describe what texture coordinates do that a bake cannot serve: overlap, or leave the unit square."""
+    """Return warnings of texture coordinates that spoil maps: those that overlap or leave the unit square."""
     from gdtool.geometry.uv_raster import owner_count
 
     out = []
@@ -151,25 +152,27 @@ def uv_warnings(target: Target) -> list[str]:
 def read_origin(
     source: Folder | Path | str, choice: SourceChoice, target: Target, matrix: np.ndarray
 ) -> tuple[Origin, bool]:
-    """Read what to bake from: the surface with its views, else the model that is named or was remeshed.
+    """Read what to bake from: the surface with its views, or else a model.
 
-    source is what the mesh was read from; matrix (4, 4) maps the normalised frame to the model's. Also returns whether
-    what was read is inside out beside the target; its faces are then turned round.
+    The model is the one that `choice` names, or the one that the mesh was remeshed from. source: what the mesh was read
+    from. matrix (4, 4): from the normalised frame to the model's. Also returns whether the source's faces were flipped,
+    because nine in ten faced away from the target's.
     """
     origin = _origin(source, choice, target, matrix)
-    few = slice(None, None, max(1, len(target.faces) // MOST_COMPARED))
-    turned = origin.source.turn_to(target.vertices[target.faces[few]].mean(1), target.normals[few].mean(1))
+    vertices, faces = target.mesh.vertices, target.mesh.faces
+    few = slice(None, None, max(1, len(faces) // MOST_COMPARED))
+    turned = origin.source.flip_if_inside_out(vertices[faces[few]].mean(1), target.normals[few].mean(1))
     return origin, turned
 
 
 def _origin(source: Folder | Path | str, choice: SourceChoice, target: Target, matrix: np.ndarray) -> Origin:
-    """Read the surface or the model of read_origin."""
+    """Read the surface with its views, or else the model, as read_origin() does, but without flipping faces."""
     if choice.model is None and choice.surface is not None:
         return _surface_origin(choice)
     from gdtool.assets.load import load_scene
 
     def footprint(detail: float) -> float:
-        size, samples = fineness(target, detail, choice.size, choice.samples)
+        size, samples = size_and_samples(target, detail, choice.size, choice.samples)
         # Bilinear lookups average as well: a mip level as coarse as the sample is wide would blur twice.
         return 0.5 * texel_width(target, size) / samples**0.5
 
@@ -190,7 +193,7 @@ def _surface_origin(choice: SourceChoice) -> Origin:
         views = read_views(choice.views, (*MATERIALS, "normal"))
         for domain in (*MATERIALS, "normal"):
             if domain not in views.images:
-                choice.skipped.append((f"{domain} views", "the views do not hold it: the surface's vertices serve"))
+                choice.skipped.append((f"{domain} views", "the views do not have it: the surface's vertices are used"))
     use_field = surface.content.field and not (views and set(MATERIALS) <= set(views.images))
     network = material_field(surface.file("field.safetensors"), choice.device) if use_field else None
     views = views if views is not None and views.images else None
@@ -198,14 +201,14 @@ def _surface_origin(choice: SourceChoice) -> Origin:
 
 
 def _read_picture(choice: SourceChoice, views: Views) -> Picture | None:
-    """Read the picture that the views were generated from, where their folder has it and they have an albedo."""
+    """Read the picture that the views were generated from; None where their folder lacks it or they have no albedo."""
     from gdtool.folders.views import read_picture
 
     image_and_camera = read_picture(choice.views, views.cameras)
     if image_and_camera is None or "albedo" not in views.images:
         missing = image_and_camera is None
         choice.skipped.append(
-            ("picture", "the views' folder holds none" if missing else "the views hold no albedo for its detail")
+            ("picture", "the views' folder holds none" if missing else "the views have no albedo to add its detail to")
         )
         return None
     image, camera = image_and_camera

@@ -1,7 +1,7 @@
 """Make coarser levels of an unwrapped mesh that share its maps, by decimation that preserves UV seams.
 
-A point of a coarse level has about the same texture coordinates as the point of the full mesh that it stands for. So
-the same maps serve every level; `drift` measures how well.
+A point of a coarse level has about the same texture coordinates as the nearest point of the full mesh. So all levels
+use the same maps; `drift` measures the difference.
 """
 
 from __future__ import annotations
@@ -18,17 +18,20 @@ from gdtool.core.native import imported
 from gdtool.core.threads import mapped
 from gdtool.geometry.meshes import TriMesh
 
-# The largest mean drift of a level, as a share of the extent: beyond it, a level shows the maps of other parts.
+# The largest mean drift of a level, as a share of the extent: with more, a level reads the maps of other parts.
 MAX_DRIFT = 0.02
-# A level that cannot come down to what is asked is still worth having with less than this share of the one before.
+# A level with more triangles than requested is kept if it has less than this share of those of the level before.
 MAX_SHARE = 0.9
-# The most triangles of a level, as a multiple of what is asked, without a warning.
+# The most triangles of a level, as a multiple of those requested, without a warning.
 MAX_EXCESS = 1.5
 
 
 @dataclass
 class Levels:
-    """Coarser levels, finest first; figures for the report; what was left out and why; warnings."""
+    """Coarser levels of detail, finest first.
+
+    report: figures for the report. skipped: (what, why) of each level that was left out.
+    """
 
     targets: list[Target] = field(default_factory=list)
     report: dict[str, float] = field(default_factory=dict)
@@ -41,26 +44,27 @@ def make_levels(target: Target, count: int, threads: int = 1) -> Levels:
 
     Levels that cannot be made, are hardly coarser, or drift too far on the maps are left out.
     """
-    counts = [max(len(target.faces) >> k, 4) for k in range(1, count)]
-    out, previous = Levels(), len(target.faces)
+    counts = [max(len(target.mesh.faces) >> k, 4) for k in range(1, count)]
+    out, previous = Levels(), len(target.mesh.faces)
     # Each level is made by a child process: threads only wait for them.
     for wanted, (level, why) in zip(counts, mapped(lambda n: coarser(target, n), counts, threads), strict=True):
-        if level is not None and len(level.faces) > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
-            level, why = None, f"it cannot have fewer than {len(level.faces)} triangles without tearing a seam"
+        reached = 0 if level is None else len(level.mesh.faces)
+        if reached > max(MAX_SHARE * previous, MAX_EXCESS * wanted):
+            level, why = None, f"it cannot have fewer than {reached} triangles without tearing a seam"
         if level is None:
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
         drifted = drift(level, target)
         if drifted["drift_mean"] > MAX_DRIFT:
-            why = f"it would slide {100 * drifted['drift_mean']:.1f} % of the extent on the maps"
+            why = f"its surface would drift on the maps by {100 * drifted['drift_mean']:.1f} % of the extent"
             out.skipped.append((f"level of {wanted} triangles", why))
             continue
-        previous = len(level.faces)
+        previous = reached
         if previous > MAX_EXCESS * wanted:
             out.warnings.append(f"the level of {wanted} triangles has {previous}: fewer would tear a seam")
         out.targets.append(level)
         name = f"lod{len(out.targets)}"
-        out.report[f"{name}_triangles"] = len(level.faces)
+        out.report[f"{name}_triangles"] = reached
         out.report |= {f"{name}_{figure}": value for figure, value in drifted.items()}
     return out
 
@@ -113,7 +117,7 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
         with temporary_folder() as folder:
             mesh, uv = call(
                 collapse_textured,
-                TriMesh(target.vertices, target.faces.astype(np.int64)),
+                TriMesh(target.mesh.vertices, target.mesh.faces.astype(np.int64)),
                 target.uv[target.face_uvs],
                 target_faces,
                 str(folder),
@@ -129,17 +133,16 @@ def coarser(target: Target, target_faces: int, seconds: float = 120.0) -> tuple[
 
 
 def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) -> dict[str, float]:
-    """Measure how far a level's surface is from the full mesh's at the same texture coordinates.
+    """Measure how far a level's surface is from the full mesh's surface at equal texture coordinates.
 
-    Compares `count` points of the level, on a chart image of side `size`. Returns drift_mean and drift_p99, shares of
-    the full mesh's extent, and outside, the share of the level's surface whose texture coordinates lie in no chart.
+    Compares `count` points of the level. The full mesh's points are looked up in a raster of its charts, `size` texels
+    a side. Returns drift_mean and drift_p99, as shares of the full mesh's extent, and outside: the share of the level's
+    surface whose texture coordinates lie in no chart.
     """
     from gdtool.geometry.distance import sample_surface
     from gdtool.geometry.uv_raster import Barycentrics, extend_owners, owners_of
 
-    points, face_idx, barycentric = sample_surface(
-        TriMesh(level.vertices, level.faces), count, np.random.default_rng(0)
-    )
+    points, face_idx, barycentric = sample_surface(level.mesh, count, np.random.default_rng(0))
     uv = np.einsum("nk,nkc->nc", barycentric, level.uv[level.face_uvs[face_idx]])
     owner = owners_of(full.uv, full.face_uvs, size)
     inside = Barycentrics(full.uv, full.face_uvs)
@@ -149,9 +152,9 @@ def drift(level: Target, full: Target, size: int = 1024, count: int = 20_000) ->
     column, row = np.clip((uv * size).astype(np.int64), 0, size - 1).T
     face = owner[row * size + column]
     known = face >= 0
-    at = inside.at(face[known], uv[known, 0], uv[known, 1])
-    there = np.einsum("nk,nkc->nc", np.clip(at, -1, 2), full.vertices[full.faces[face[known]]])
-    apart = np.linalg.norm(there - points[known], axis=1) / float(np.ptp(full.vertices, axis=0).max())
+    weights = inside.at(face[known], uv[known, 0], uv[known, 1])
+    full_points = np.einsum("nk,nkc->nc", np.clip(weights, -1, 2), full.mesh.vertices[full.mesh.faces[face[known]]])
+    apart = np.linalg.norm(full_points - points[known], axis=1) / full.mesh.extent
     return {
         "drift_mean": float(apart.mean()),
         "drift_p99": float(np.percentile(apart, 99)),

@@ -1,4 +1,4 @@
-"""Make the maps that files hold: pack and quantise values, and leave out what is constant."""
+"""Make the maps to store: pack and quantise values, and leave out what is constant."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ HEIGHT_BITS = 16  # a step of 8 bits is a visible terrace
 
 
 class SkippedMap(NamedTuple):
-    """A map that was left out: what, why, and the seconds that storing it would have taken, None where nothing is."""
+    """A map that was left out: its name, the reason, and the seconds that storing it would have taken.
+
+    seconds is None where leaving it out saves no time.
+    """
 
     what: str
     why: str
@@ -35,11 +38,12 @@ class SkippedMap(NamedTuple):
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How to store maps.
+    """Options for storing maps.
 
-    bits: 8 or 16 a channel. padding: texels of gutter around charts; None: as far as there is room. normal_map: "auto"
-    leaves a flat one out. least_alpha: color of less alpha is never seen and is filled like a gutter; otherwise
-    filtering would bleed what painters leave there, mostly black, into its surroundings.
+    bits: 8 or 16 per channel. padding: width in texels of the gutters around charts; None fills all free texels.
+    normal_map: "on", "off", or "auto", which leaves a flat map out. least_alpha: alpha below which a texel's color is
+    never seen. Such texels are filled like gutters. Their color is mostly black, and filtering would mix it into their
+    surroundings.
     """
 
     bits: int = 8
@@ -51,13 +55,14 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps as stored, (s, s, c) uint8 or uint16; None where a factor takes a map's place or there is nothing to store.
+    """Maps as stored, (s, s, c) uint8 or uint16; None where a factor replaces the map or the material has no such map.
 
-    base_color: sRGB, perhaps with alpha. orm: R occlusion, G roughness, B metallic. normal: tangent space, +Y up.
-    emissive: sRGB. extra: grey maps that no material refers to, height and confidence.
+    base_color: sRGB, with alpha as a fourth channel unless all is opaque. orm: R occlusion, G roughness, B metallic.
+    normal: tangent space, +Y up. emissive: sRGB. extra: grey maps that no material refers to, height and confidence.
+
     factors: the material's factors by name: base_color linear RGBA, roughness, metallic, and emissive linear RGB where
-    anything shines; height is the distance above and below the surface that 1 and 0 of that map stand for.
-    has_occlusion, has_roughness_metallic: whether the R, or the G and B, of orm mean something.
+    anything emits light. factors["height"] is the distance from the surface, above and below, that 1 and 0 in the
+    height map stand for. has_occlusion: whether R of orm is to be used; has_roughness_metallic: whether G and B are.
     """
 
     size: int
@@ -73,9 +78,9 @@ class Maps:
 
 
 def require_map_memory(name: str, size: int) -> None:
-    """Raise ResourceError when maps of size x size texels will not fit into free memory, rather than be killed midway.
+    """Raise ResourceError when maps of size x size texels will not fit into free memory.
 
-    name: of the object, for the message.
+    Without this check the process would be killed midway. name: the object's name, for the message.
     """
     needed = BYTES_PER_TEXEL * size * size
     try:
@@ -105,9 +110,9 @@ def quantise(image: np.ndarray, bits: int) -> np.ndarray:
 def constant_of(
     values: np.ndarray, tolerance: float = CONSTANT_RANGE, encoding: Callable = lambda x: x
 ) -> np.ndarray | None:
-    """Return the middle of values (n,) or (n, c), float64, when no channel spans more than tolerance, else None.
+    """Return the middle of values (n,) or (n, c), float64, where no channel spans more than `tolerance`, else None.
 
-    Both are measured after encoding, a monotonic function.
+    The span and the result are those of encoding(values); encoding is monotonic.
     """
     if not len(values):
         return None
@@ -130,13 +135,14 @@ def make_maps(
     occlusion: np.ndarray | None = None,
     options: MapOptions = MapOptions(),
 ) -> Maps:
-    """Make the maps of what n texels read.
+    """Make the maps to store from the values of n texels.
 
     Args:
-        texels: where they lie.
-        values: as bake.Baked.values: albedo, roughness, metallic, tangent_normal, and perhaps alpha, emissive (n, 3)
-            linear, height (n,) in the target's units, confidence (n,) in [0, 1].
-        occlusion: (n,) ambient occlusion, 1 where nothing is occluded.
+        texels: where the n texels lie.
+        values: arrays by name, as in bake.pipeline.Baked.values: albedo, roughness, metallic, tangent_normal, and where
+            the source has them alpha, emissive (n, 3) linear, height (n,) in the target's units, confidence (n,) in
+            [0, 1].
+        occlusion: (n,) ambient visibility in [0, 1], 1 where nothing is occluded; None without.
         options: how to store them.
     """
     from gdtool.images.color import srgb_from_linear
@@ -182,9 +188,10 @@ def make_maps(
 
 @dataclass
 class _Layers:
-    """Maps while they are chosen: channels (n,) of each that is stored, factors, and what is left out and why.
+    """The maps to store, while they are chosen.
 
-    A channel that is None is 1 everywhere.
+    channels: by map name, the values (n,) of each channel; None is 1 everywhere. factors: the material's, by name.
+    skipped: what was left out, and why.
     """
 
     channels: dict[str, list[np.ndarray | None]] = field(default_factory=dict)
@@ -195,7 +202,7 @@ class _Layers:
 def _add_base_color(
     layers: _Layers, texels: Texels, values: dict[str, np.ndarray], color: list[np.ndarray]
 ) -> np.ndarray | None:
-    """Add base color, as a map or a factor; returns alpha (n,), None where everything is opaque."""
+    """Add the base color as a map or a factor; return alpha (n,), None where everything is opaque."""
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
     inside = slice(0, texels.inside)
@@ -211,14 +218,17 @@ def _add_base_color(
         layers.channels["base_color"] = color if alpha is None else [*color, alpha]
     else:
         layers.factors["base_color"] = (*(round(float(x), 6) for x in linear_from_srgb(np.array(constants))), 1.0)
-        layers.skipped.append(("base_color map", "base color is constant: a factor says it"))
+        layers.skipped.append(("base_color map", "base color is constant: a factor stores it"))
     return alpha
 
 
 def _add_orm(
     layers: _Layers, texels: Texels, values: dict[str, np.ndarray], occlusion: np.ndarray | None
 ) -> tuple[bool, bool]:
-    """Add roughness, metallic and occlusion; returns whether roughness or metallic varies, and occlusion is stored."""
+    """Add roughness, metallic and occlusion to the packed map.
+
+    Returns whether roughness or metallic varies, and whether occlusion is stored.
+    """
     inside = slice(0, texels.inside)
     packed: list[np.ndarray | None] = [None, None, None]
     for channel, name in ((1, "roughness"), (2, "metallic")):
@@ -230,7 +240,7 @@ def _add_orm(
             layers.factors[name] = (round(float(constant), 6),)
     varies = any(channel is not None for channel in packed)
     if not varies:
-        layers.skipped.append(("roughness and metallic map", "both are constant: factors say them"))
+        layers.skipped.append(("roughness and metallic map", "both are constant: factors store them"))
     open_everywhere = occlusion is not None and occlusion[inside].min(initial=1) > 1 - 2 / 255
     if open_everywhere:
         layers.skipped.append(("occlusion map", "nothing is occluded"))
@@ -243,7 +253,7 @@ def _add_orm(
 
 
 def _add_normal(layers: _Layers, texels: Texels, values: dict[str, np.ndarray], options: MapOptions) -> None:
-    """Add the normal map, unless options leave it out."""
+    """Add the normal map, unless the options or its flatness leave it out."""
     angle = flat_angle(values["tangent_normal"][: texels.inside])
     if options.normal_map == "on" or (options.normal_map == "auto" and angle > FLAT_DEGREES):
         layers.channels["normal"] = list(np.moveaxis(values["tangent_normal"], -1, 0))
@@ -264,11 +274,11 @@ def _add_emissive(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]
         layers.factors["emissive"], layers.channels["emissive"] = (round(top, 6),) * 3, scaled
     else:
         layers.factors["emissive"] = tuple(round(float(x) * top, 6) for x in linear_from_srgb(np.array(constants)))
-        layers.skipped.append(("emissive map", "emission is constant: a factor says it"))
+        layers.skipped.append(("emissive map", "emission is constant: a factor stores it"))
 
 
 def _add_extra(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]) -> None:
-    """Add the height and confidence maps where their values are there."""
+    """Add the height and confidence maps where `values` has them."""
     if "height" in values:
         reach = max(float(np.abs(values["height"][: texels.inside]).max(initial=0)), 1e-6)
         layers.factors["height"] = (reach,)
@@ -279,9 +289,10 @@ def _add_extra(layers: _Layers, texels: Texels, values: dict[str, np.ndarray]) -
 
 @dataclass(frozen=True)
 class _Plane:
-    """One channel of a map.
+    """One channel of a map before it is stored.
 
-    values (n,) in [0, 1], or a component of unit vectors; None for 1 everywhere. encoding: applied before storing.
+    values (n,): in [0, 1], or a component of unit vectors in [-1, 1]; None is 1 everywhere. encoding: function applied
+    before storing, such as sRGB.
     """
 
     values: np.ndarray | None
@@ -292,9 +303,9 @@ class _Plane:
 def _stored(
     texels: Texels, layers: dict[str, list[_Plane]], bits: dict[str, int], threads: int
 ) -> dict[str, np.ndarray]:
-    """Store each layer's channels as (s, s, c) uint8 or uint16, gutters filled.
+    """Store each map's channels as (s, s, c) uint8 or uint16, with gutters filled.
 
-    "normal" is made unit after filling, and stored as 0.5 n + 0.5.
+    bits: by map name. The map "normal" is scaled to unit length after filling, and stored as 0.5 n + 0.5.
     """
     out = {
         name: np.empty((texels.size, texels.size, len(layer)), np.uint8 if bits[name] == 8 else np.uint16)
@@ -334,14 +345,14 @@ def _stored(
 
 
 def directx(normal: np.ndarray) -> np.ndarray:
-    """Return a stored normal map with its green channel inverted, +Y down."""
+    """Invert the green channel of a stored normal map, so that +Y points down; returns a copy."""
     out = normal.copy()
     out[..., 1] = np.iinfo(normal.dtype).max - normal[..., 1]
     return out
 
 
 def contact_sheet_of(maps: Maps, width: int = 384) -> np.ndarray:
-    """Show the maps side by side, channels of the packed one apart and factors as squares: (h, w, 3) uint8."""
+    """Draw the maps side by side, (h, w, 3) uint8: packed channels one by one, factors as plain squares."""
     from gdtool.images.color import srgb_from_linear
     from gdtool.images.contact import contact_sheet
 

@@ -1,4 +1,4 @@
-"""Prepare what a bake reads from: a surface with its views, or a model with its textures."""
+"""Prepare the source of a bake: a surface with its views, or a model with its textures."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from gdtool.geometry.tangents import dot
 
 @dataclass(frozen=True)
 class Origin:
-    """A source in the normalised frame, its material lookup, its vertex normals (v, 3), and how viewers show it.
+    """A source in the normalised frame, the lookup of its material, and its vertex normals (v, 3).
 
-    label: where materials come from, for the report. detail: width of the finest detail that the source has, in the
-    normalised frame. It is a texel of its textures, half a pixel of its views, a pixel of the picture they were
-    generated from, or half an edge of its mesh.
+    label: where materials come from, for the report. alpha_mode, alpha_cutoff, double_sided: as in glTF. detail: width
+    of the source's finest detail in the normalised frame. It is the least of: a texel of the textures, half a pixel of
+    the views, a pixel of the picture that the views were generated from, and without textures half an edge of the mesh.
     """
 
     source: Source
@@ -80,15 +80,14 @@ def from_surface(
     field: Callable[[np.ndarray], dict[str, np.ndarray]] | None = None,
     picture: Picture | None = None,
 ) -> Origin:
-    """Prepare a surface: views give material and normals where they see it well, its vertices elsewhere.
+    """Prepare a surface: materials and normals come from views where these see it well, elsewhere from its vertices.
 
-    field (material_field) replaces the vertices for materials that the views lack. picture: the one that the views were
-    generated from, for its finer detail.
+    field (see material_field) replaces the vertices for the materials that no view has. picture: the one that the views
+    were generated from; it adds finer detail.
     """
-    source = Source(TriMesh(surface.vertices, surface.faces))
-    normals = (
-        surface.normals if surface.normals is not None else vertex_normals(TriMesh(surface.vertices, surface.faces))
-    )
+    mesh = TriMesh(surface.vertices, surface.faces)
+    source = Source(mesh)
+    normals = surface.normals if surface.normals is not None else vertex_normals(mesh)
     attributes = {
         "albedo": surface.albedo,
         "roughness": surface.roughness,
@@ -104,7 +103,7 @@ def from_surface(
             lookup, label = _with_field(lookup, source, field, missing), "field: " + " ".join(missing)
     if "normal" in images and not _views_are_finer(views, source):
         del images["normal"]
-    detail = 0.5 * _edge(source)
+    detail = 0.5 * _median_edge(source)
     if not images:
         return Origin(source, lookup, normals, label, detail=detail)
     visibilities = [
@@ -121,23 +120,26 @@ def from_surface(
 def _with_field(
     lookup: Lookup, source: Source, field: Callable[[np.ndarray], dict[str, np.ndarray]], names: list[str]
 ) -> Lookup:
-    """Make a lookup that takes the named materials from a field, the rest from lookup."""
+    """Make a lookup that takes the named materials from a field, and the others from `lookup`."""
 
     def with_field(places: Places) -> dict[str, np.ndarray]:
-        read = field(source.at(places.face_idx, places.barycentric, source.vertices))
+        read = field(source.at(places.face_idx, places.barycentric, source.mesh.vertices))
         return {**lookup(places), **{name: read[name] for name in names}}
 
     return with_field
 
 
 def _views_are_finer(views: Views, source: Source) -> bool:
-    """Tell whether view normals can hold more detail: a pixel spans at most 1.5 times the surface's typical edge."""
-    return _view_pixel(views) <= 1.5 * _edge(source)
+    """Return whether the views' normals can hold more detail than the surface's vertices.
+
+    They can where a pixel spans at most 1.5 times the surface's median edge.
+    """
+    return _view_pixel(views) <= 1.5 * _median_edge(source)
 
 
-def _edge(source: Source) -> float:
-    """Measure the median edge length of the source's triangles."""
-    corners = source.vertices[source.faces]
+def _median_edge(source: Source) -> float:
+    """Compute the median edge length of the source's triangles."""
+    corners = source.mesh.vertices[source.mesh.faces]
     return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, 1), axis=-1)))
 
 
@@ -148,9 +150,9 @@ def _view_pixel(views: Views) -> float:
 
 
 def texture_detail(scene: Scene) -> float | None:
-    """Measure the width of a texel of a scene's finest textures on its surface, in the scene's units.
+    """Measure the width on the surface of a texel of the finest textures, in the scene's units.
 
-    The median over the textured area; None where nothing is textured.
+    This is the median over the textured area; None where no face has a texture.
     """
     from gdtool.geometry.normals import face_normals
 
@@ -190,10 +192,10 @@ def texture_detail(scene: Scene) -> float | None:
 def from_scene(
     scene: Scene, source_from_world: np.ndarray, footprint: Callable[[float], float] = lambda detail: 0.0
 ) -> Origin:
-    """Prepare a textured model in its file's frame; source_from_world (4, 4) maps the normalised frame to it.
+    """Prepare a textured model, given in its file's frame; source_from_world (4, 4) maps the normalised frame to it.
 
-    footprint(detail) is the width, in the normalised frame, over which the textures are averaged where they are read;
-    detail is the model's (see Origin).
+    footprint: from the model's detail (see Origin), the width over which textures are averaged where they are read.
+    Both are in the normalised frame.
     """
     from gdtool.shading.render.surface_points import SurfaceLookup
 
@@ -201,9 +203,7 @@ def from_scene(
     turn = matrix[:3, :3] / np.sqrt((matrix[:3, 0] ** 2).sum())
     turn, unturned = turn.astype(np.float32), bool(np.allclose(turn, np.eye(3), atol=1e-9))
     source = Source(TriMesh(transform_points(matrix, scene.vertices), scene.faces))
-    normals = (
-        scene.normals @ turn.T if scene.normals is not None else vertex_normals(TriMesh(source.vertices, source.faces))
-    )
+    normals = scene.normals @ turn.T if scene.normals is not None else vertex_normals(source.mesh)
 
     # Single precision is exact to 1/1000 of a texel of a 16384² texture, and takes half the time.
     points = SurfaceLookup(
@@ -215,7 +215,9 @@ def from_scene(
     )
     texel = texture_detail(scene)
     # With vertex colors, or factors only, the mesh limits the detail.
-    detail = 0.5 * _edge(source) if texel is None else texel / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    detail = (
+        0.5 * _median_edge(source) if texel is None else texel / float(np.sqrt((source_from_world[:3, 0] ** 2).sum()))
+    )
     width = footprint(detail) * np.sqrt((source_from_world[:3, 0] ** 2).sum())
 
     def lookup(places: Places) -> dict[str, np.ndarray]:
@@ -226,13 +228,13 @@ def from_scene(
         inward = dot(normal, source.normals_of(places.face_idx)) < 0
         if inward.any():
             normal[inward] *= -1
-        out = {name: read[name] for name in kept}
+        out = {name: read[name] for name in names}
         return {**out, "confidence": np.ones(len(normal), np.float32), "normal": normal}
 
     modes = {material.alpha_mode for material in scene.materials}
     mode = next((m for m in ("BLEND", "MASK") if m in modes), "OPAQUE")
     shines = any(max(material.emissive) > 0 for material in scene.materials)
-    kept = [
+    names = [
         "albedo",
         "roughness",
         "metallic",

@@ -36,7 +36,10 @@ class Gutters:
             self._weights.append(weight)
 
     def fill(self, channel: np.ndarray, background: float | None = None) -> np.ndarray:
-        """Fill a channel (h, w) float32, 0 outside the mask, in place; background replaces the mean. Returns it."""
+        """Fill a channel (h, w) float32 in place and return it; it has to be 0 outside the mask.
+
+        Far texels get `background` instead of the channel's mean, where it is given.
+        """
         if not self._weights:
             return channel
         if self._far is not None and background is None:
@@ -105,9 +108,10 @@ def push_pull(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def fill_gutters(
     image: np.ndarray, mask: np.ndarray, padding: int | None = None, background: float | None = None
 ) -> np.ndarray:
-    """Fill `padding` texels around the mask, all texels when None; farther ones get background, else the mean.
+    """Fill `padding` texels around the mask, or all texels if it is None.
 
-    image (h, w, c) or (h, w) float; mask (h, w) bool of the known texels, which stay unchanged.
+    Texels farther away get `background`, or the mean of the known texels if that is None. image (h, w, c) or (h, w)
+    float; mask (h, w) bool of the known texels, which stay unchanged.
     """
     mask = np.asarray(mask, bool)
     if not mask.any() or mask.all():

@@ -1,4 +1,4 @@
-"""Bake what each texel of a mesh's map reads from the surface that the mesh stands for."""
+"""Bake the values of all texels of a mesh: look each texel up on the source surface, and average where it varies."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from gdtool.bake.target import TEXELS_AT_ONCE, Target, Texels, surface_at
 from gdtool.core.threads import mapped
 from gdtool.geometry.tangents import dot, encode_tangent_space, unit
 
-# Looks the material of n places up: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3) unit in world
-# axes, and alpha (n,) where the source has one.
+# A function that looks up the material at n places: albedo (n, 3) linear, roughness (n,), metallic (n,), normal (n, 3)
+# unit in world axes, and alpha (n,) where the source has one.
 Lookup = Callable[[Places], dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class ViewsOfSource:
-    """Views of the source, and what their cameras see of it.
+    """Views of the source: their images, and the depths and silhouettes that their cameras see.
 
-    images: (k, h, w[, c]) by domain: albedo linear, roughness, metallic, normal. mask (k, h, w) coverage. picture: the
-    finer picture that one of the views was made from.
+    images: (k, h, w[, c]) by domain: albedo linear, roughness, metallic, normal. mask (k, h, w): coverage. picture: the
+    one of higher resolution that one of the views was made from.
     """
 
     visibilities: list[ViewVisibility]
@@ -37,9 +37,9 @@ class ViewsOfSource:
 
 @dataclass(frozen=True)
 class Baked:
-    """What n texels read: float32 values by name, and the views' confidence seen (n,), None without views.
+    """The baked values of n texels: float32 arrays (n,) or (n, c) by name.
 
-    report: figures for the manifest.
+    seen (n,): the confidence in [0, 1] that views see the texel, None without views. report: figures for the manifest.
     """
 
     values: dict[str, np.ndarray]
@@ -47,15 +47,16 @@ class Baked:
     report: dict[str, float] = field(default_factory=dict)
 
     def seen_share(self, inside: int) -> float:
-        """Compute the share of the first `inside` texels that views show with a confidence above one half."""
+        """Compute the share of the first `inside` texels that views see with a confidence above one half."""
         return 0.0 if self.seen is None else float((self.seen[:inside] > 0.5).mean())
 
 
 @dataclass(frozen=True)
 class BakeOptions:
-    """How to bake: samples per texel where neighbours differ (a square number), threads, and two more values to keep.
+    """Options of a bake.
 
-    height: how far above the target, along its normal, the source lies. confidence: the lookup's confidence.
+    samples: per texel where neighbouring texels differ, a square number. height: whether to store how far the source
+    lies above the target along the target's normal. confidence: whether to store the lookup's confidence.
     """
 
     samples: int = 1
@@ -79,13 +80,13 @@ def vertex_lookup(source: Source, attributes: dict[str, np.ndarray], normals: np
 
 
 def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lookup, list[str]]:
-    """Make a lookup that reads the views, blended into the given lookup by their confidence.
+    """Make a lookup that blends what views show into the values of another lookup, by the views' confidence.
 
-    It adds the value "seen" (n,), the confidence. Also returns the domains that come from views.
+    It adds the value "seen" (n,), that confidence. Also returns the names of the values that come from views.
     """
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
-    domains = [d for d in ("albedo", "roughness", "metallic", "normal") if d in views.images]
+    domains: list[str] = [d for d in ("albedo", "roughness", "metallic", "normal") if d in views.images]
     encoded = {}
     for domain in domains:
         image = views.images[domain]
@@ -103,7 +104,7 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
 
     def blended(places: Places) -> dict[str, np.ndarray]:
         out = dict(lookup(places))
-        points = source.at(places.face_idx, places.barycentric, source.vertices)
+        points = source.at(places.face_idx, places.barycentric, source.mesh.vertices)
         prior = [srgb_from_linear(out[d]) if d == "albedo" else out[d] for d in domains]
         prior = np.concatenate([p if p.ndim == 2 else p[:, None] for p in prior], 1)
         value, seen, shares = observe(points, out["normal"], images, prior)
@@ -133,9 +134,10 @@ def with_views(lookup: Lookup, source: Source, views: ViewsOfSource) -> tuple[Lo
 def _sharpen(
     out: dict[str, np.ndarray], points: np.ndarray, picture: Picture, visibility: ViewVisibility, share: np.ndarray
 ) -> None:
-    """Multiply the picture's fine detail into the albedo of points (n, 3), by its view's share (n,) in it.
+    """Multiply the picture's fine detail into the albedo of points (n, 3).
 
-    Metals are left out: what they show is a reflection, not detail of the material.
+    visibility: of the view that the picture belongs to; share (n,) in [0, 1]: that view's share in the albedo, which
+    scales the detail. Metals are left out: the picture shows a reflection there, not detail of the material.
     """
     share = share * silhouette_margin(visibility, points) * (1 - out["metallic"])
     seen = np.flatnonzero(share > 0.01)
@@ -146,9 +148,10 @@ def _sharpen(
 def _read(
     target: Target, source: Source, lookup: Lookup, reach: np.ndarray, face_idx: np.ndarray, barycentric: np.ndarray
 ) -> tuple[dict[str, np.ndarray], tuple[np.ndarray, ...], Places]:
-    """Look up the source at places on the target.
+    """Look up the source at points of the target.
 
-    Returns the lookup's values, the target's surface_at, and the places on the source.
+    Returns the lookup's values, the target's positions and frames (target.surface_at), and the points' places on the
+    source.
     """
     frame = surface_at(target, face_idx, barycentric)
     places = reproject(frame[0], unit(frame[1]), reach[face_idx], source)
@@ -167,13 +170,14 @@ def bake(
     options: BakeOptions = BakeOptions(),
     progress: Callable = lambda iterable, total, label: iterable,
 ) -> Baked:
-    """Bake what lookup says of the source into the texels.
+    """Bake the values that `lookup` reads from the source into the texels.
 
-    reach (t,) is from reproject.vertex_reach. progress(iterable, total, label) reports the parts done.
+    reach (t,): how far from each triangle to look for the source (reproject.cage_offsets). progress(iterable, total,
+    label) reports the parts done.
 
-    The values are albedo, roughness, metallic, tangent_normal (n, 3), and whatever else lookup gives besides normal.
-    Where options ask for them, also height (n,) and confidence (n,). The confidence is 0 where no ray along the normal
-    meets the source and the nearest point serves. Where neighbouring texels differ, values are means over several
+    The values are albedo, roughness, metallic, tangent_normal (n, 3), and everything else that lookup returns, except
+    normal. Options add height (n,) and confidence (n,). The confidence is 0 where no ray along the normal meets the
+    source, so that the nearest point was read instead. Where neighbouring texels differ, values are means over several
     samples (supersample.supersample).
     """
     reach = reach.astype(np.float32)
@@ -185,7 +189,7 @@ def bake(
         out["tangent_normal"] = encode_tangent_space(*frame[1:], out.pop("normal"))
         if options.height:
             out["height"] = dot(
-                source.at(places.face_idx, places.barycentric, source.vertices) - frame[0], unit(frame[1])
+                source.at(places.face_idx, places.barycentric, source.mesh.vertices) - frame[0], unit(frame[1])
             )
         certain = out.pop("confidence", None)
         if options.confidence:
@@ -216,9 +220,9 @@ def bake(
 def occlusion_tracer(
     target: Target, source: Source, reach: np.ndarray, normals: np.ndarray, rays: int, seed: int, threads: int = 1
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Make trace(face_idx, barycentric) -> (n,), the ambient visibility of the source at places on the target.
+    """Make the function trace(face_idx, barycentric) -> (n,): ambient visibility of the source at points of the target.
 
-    normals (v, 3) are the source's; rays is their number per place.
+    reach (t,): see bake(). normals (v, 3): the source's vertex normals. rays: their number per point.
     """
     lift = 5e-4 * source.extent
 
@@ -226,7 +230,7 @@ def occlusion_tracer(
         def run(part: slice) -> np.ndarray:
             points, facing, _, _ = surface_at(target, face_idx[part], barycentric[part])
             places = reproject(points, unit(facing), reach[face_idx[part]], source)
-            at = source.at(places.face_idx, places.barycentric, source.vertices)
+            at = source.at(places.face_idx, places.barycentric, source.mesh.vertices)
             geometric = source.face_normals[places.face_idx] * np.where(places.from_behind, -1, 1)[:, None]
             smooth = source.at(places.face_idx, places.barycentric, normals)
             side = dot(smooth, geometric)[:, None]

@@ -23,7 +23,7 @@ REFERENCE_GAIN = 4.0
 
 @dataclass(frozen=True)
 class ViewVisibility:
-    """What one camera sees of the surface, for each pixel of its image.
+    """The depths and silhouettes of a surface in one camera's image, for each pixel.
 
     nearest, farthest (h, w): depths of the pixel's nearest and farthest sample; inf and -inf where all miss.
     edge_distance (h, w): pixels to the nearest silhouette or depth step, at least 0.5.
@@ -39,8 +39,9 @@ class ViewVisibility:
 class ViewStack:
     """Images of k views, to be read together.
 
-    values (k, h, w, c) in stored units, not premultiplied; mask (k, h, w) coverage. reference: the view that the others
-    were generated from, None where there is none; color_channels: how many of the first channels are its colors.
+    values (k, h, w, c): as stored, in [0, 1], not premultiplied; mask (k, h, w): coverage. reference: index of the view
+    that the others were generated from, None where there is none. color_channels: the number of leading channels that
+    are colors; the reference has priority in these.
     """
 
     visibilities: list[ViewVisibility]
@@ -51,7 +52,7 @@ class ViewStack:
 
 
 class Observation(NamedTuple):
-    """What views say about n points: values (n, c), confidence (n,) in [0, 1], and each view's share (k, n)."""
+    """The blend of views at n points: values (n, c), confidence (n,) in [0, 1], and each view's share (k, n)."""
 
     values: np.ndarray
     confidence: np.ndarray
@@ -59,9 +60,9 @@ class Observation(NamedTuple):
 
 
 def view_visibility(camera: Camera, caster, mask: np.ndarray) -> ViewVisibility:
-    """Trace what a camera sees of a surface.
+    """Trace the depths and silhouettes of a surface in a camera's image.
 
-    mask (h, w) is the view's coverage; its border counts as silhouette.
+    mask (h, w): the view's coverage in [0, 1]; its border counts as a silhouette.
     """
     from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
@@ -106,8 +107,8 @@ def _read(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read one view at the points that it shows: their indices (m,), values (m, c), quality (m,) in [0, 1].
 
-    image (h, w, c) and mask (h, w) of the view. Values are interpolated between those of the four nearest pixels that
-    lie inside the mask and at the point's depth. So neither the background nor an occluder is mixed in.
+    image (h, w, c) and mask (h, w) are the view's. Values are interpolated between those of the four nearest pixels
+    that lie inside the mask and at the point's depth. So neither the background nor an occluder is mixed in.
     """
     camera = visibility.camera
     cosine = dot(normals, _toward(camera, points))
@@ -143,7 +144,7 @@ def _read(
 
 
 def silhouette_margin(visibility: ViewVisibility, points: np.ndarray) -> np.ndarray:
-    """Rate how far points (n, 3) are from silhouettes and depth steps: 0 within one pixel, 1 from two on, (n,)."""
+    """Rate how far points (n, 3) are from silhouettes and depth steps: 0 within one pixel, 1 from two pixels on."""
     pixel = np.floor(project(visibility.camera, points)[0]).astype(np.int64)
     h, w = visibility.edge_distance.shape
     return np.clip(visibility.edge_distance[np.clip(pixel[:, 1], 0, h - 1), np.clip(pixel[:, 0], 0, w - 1)] - 1, 0, 1)
@@ -156,14 +157,15 @@ def observe(
     prior: np.ndarray | None = None,
     sharpness: float = 6.0,
 ) -> Observation:
-    """Blend what the views say about points (n, 3) of the surface with unit normals (n, 3).
+    """Blend the values of all views at points (n, 3) of the surface with unit normals (n, 3).
 
-    A view's quality grows with facing, distance to silhouettes and coverage; its weight is the quality to the power
-    sharpness. So the best view dominates and detail is not averaged away, yet the change from one view to another is
-    smooth. A view that differs from the others and from prior (n, c) fades out, but the reference never does. For its
-    color channels, the reference has REFERENCE_GAIN times the quality, 1 at most.
+    A view's quality grows with facing, distance to silhouettes and coverage. Its weight is its quality to the power
+    `sharpness`: the best view dominates, so that detail is not averaged away, yet the change from one view to another
+    is smooth. A view that differs from the others and from prior (n, c) fades out; the reference view never does. In
+    the color channels the reference's quality is multiplied by REFERENCE_GAIN, up to 1.
 
-    The confidence is 0 where no view sees a point. Shares are those of the colors where there is a reference.
+    The confidence is 0 where no view sees a point. With a reference, the shares returned are those of the color
+    channels.
     """
     count, channels = len(points), views.values.shape[-1]
     value = np.zeros((len(views.visibilities), count, channels), np.float32)
@@ -198,8 +200,9 @@ def observe(
 def _fade_outliers(value: np.ndarray, share: np.ndarray, prior: np.ndarray | None) -> np.ndarray:
     """Lower the shares (k, n) of views whose value (k, n, c) is far from the median of all views and prior (n, c).
 
-    Only where there are at least three opinions. The loss grows gradually, from half the tolerance to twice it, so that
-    a view does not end in an edge on the surface. A trace of 5 % remains, so that one view always counts.
+    This needs at least three values at a point, prior included. The loss grows gradually, from half of
+    AGREEMENT_TOLERANCE to twice it, so that no edge appears on the surface where a view stops counting. A share keeps
+    at least 5 % of itself, so that one view always counts.
     """
     opinions = np.where((share > 0)[..., None], value, np.nan)
     if prior is not None:

@@ -1,4 +1,4 @@
-"""Find, for points of the baked mesh, the places on the source surface that they stand for."""
+"""Find the point of the source surface that corresponds to each point of the baked mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.normals import face_normals
 from gdtool.geometry.tangents import dot, number_distinct_rows
 
-# The least dot product of the source face's normal with the mesh's normal at which the face is on the right side.
+# The least dot product of a source face's normal and the mesh's normal at which the two agree.
 AGREEMENT = 0.1
 # Faces that a ray meets before it gives up.
 _RETRIES = 4
@@ -27,9 +27,10 @@ _MOST_CUT = 100_000
 
 
 class Nearest:
-    """Find closest points on some faces of a mesh; keeps the search tree, which libigl builds on each call otherwise.
+    """Find closest points on faces of a mesh.
 
-    chosen (m,): indices of the faces to look among; None is all.
+    Keeps the search tree, which libigl otherwise builds on each call. chosen (m,): indices of the faces to search; None
+    searches all.
     """
 
     def __init__(self, mesh: TriMesh, chosen: np.ndarray | None = None):
@@ -54,37 +55,37 @@ class Nearest:
 
 
 class Source:
-    """Triangles to bake from, with their ray caster and search trees.
+    """The triangles to bake from, with their ray caster and search trees.
 
-    vertices (v, 3) float64, faces (f, 3), face_normals (f, 3) unit; extent: longest side of the bounding box.
+    mesh: vertices (v, 3), faces (f, 3). face_normals (f, 3) unit; extent: longest side of the bounding box.
     """
 
     def __init__(self, mesh: TriMesh):
         from gdtool.geometry.single_precision_rays import SinglePrecisionCaster
 
-        self.vertices, self.faces = np.asarray(mesh.vertices, np.float64), mesh.faces
+        self.mesh = TriMesh(np.asarray(mesh.vertices, np.float64), mesh.faces)
         self.face_normals = face_normals(mesh)[0]
         self._normal_rows = np.ascontiguousarray(self.face_normals.T, np.float32)
-        self.extent = float(np.ptp(self.vertices, axis=0).max())
+        self.extent = self.mesh.extent
         self.caster = SinglePrecisionCaster(mesh)
-        self.nearest = Nearest(TriMesh(self.vertices, self.faces))
+        self.nearest = Nearest(self.mesh)
         self._facing: dict[tuple[int, float], Nearest | None] = {}
         self._lock = Lock()
 
     def normals_of(self, face_idx: np.ndarray) -> np.ndarray:
-        """Gather unit normals (n, 3) float32 of faces, each component side by side in memory."""
+        """Gather unit normals (n, 3) float32 of faces; each component is contiguous in memory."""
         return np.take(self._normal_rows, face_idx, axis=1).T
 
     @cached_property
     def twins(self) -> np.ndarray:
-        """Index (f,) int32 of the face with the same corners that faces the other way, -1 where there is none."""
-        corners = np.sort(number_distinct_rows(self.vertices)[self.faces], axis=1)
+        """Find for each face the one with the same corners that faces the other way: (f,) int32, -1 without one."""
+        corners = np.sort(number_distinct_rows(self.mesh.vertices)[self.mesh.faces], axis=1)
         order = np.lexsort(corners.T)
         first, second = order[:-1], order[1:]
         same = (corners[first] == corners[second]).all(1)
         paired = same & (dot(self.face_normals[first], self.face_normals[second]) < 0)
         first, second = first[paired], second[paired]
-        out = np.full(len(self.faces), -1, np.int32)
+        out = np.full(len(self.mesh.faces), -1, np.int32)
         out[first], out[second] = second, first
         return out
 
@@ -93,13 +94,13 @@ class Source:
         with self._lock:
             if (axis, sign) not in self._facing:
                 chosen = np.flatnonzero(self.face_normals[:, axis] * sign > 0.25)
-                self._facing[axis, sign] = Nearest(TriMesh(self.vertices, self.faces), chosen) if len(chosen) else None
+                self._facing[axis, sign] = Nearest(self.mesh, chosen) if len(chosen) else None
             return self._facing[axis, sign]
 
-    def turn_to(self, points: np.ndarray, normals: np.ndarray) -> bool:
+    def flip_if_inside_out(self, points: np.ndarray, normals: np.ndarray) -> bool:
         """Flip all face normals if the source is inside out, and return whether it was.
 
-        It is when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
+        It counts as inside out when nine in ten of the faces nearest to points (n, 3) face away from normals (n, 3).
         """
         face, _ = self.nearest.closest(points)
         if not len(face) or (dot(self.face_normals[face], normals) < 0).mean() < 0.9:
@@ -110,16 +111,16 @@ class Source:
 
     def at(self, face_idx: np.ndarray, barycentric: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Interpolate vertex values (v,) or (v, c) at places on faces: (n,) or (n, c)."""
-        corners = values[self.faces[face_idx]]
+        corners = values[self.mesh.faces[face_idx]]
         return np.einsum("nk,nk...->n...", barycentric.astype(corners.dtype, copy=False), corners)
 
 
 @dataclass(frozen=True)
 class Places:
-    """Places on a source.
+    """Points on a source's surface.
 
-    face_idx (n,), barycentric (n, 3) float32; by_ray (n,) bool, False where the nearest point was taken; from_behind
-    (n,) bool, whether the back of the face is meant.
+    face_idx (n,), barycentric (n, 3) float32. by_ray (n,) bool: found by a ray along the normal; False where the
+    nearest point was taken. from_behind (n,) bool: whether the back of the face is seen.
     """
 
     face_idx: np.ndarray
@@ -128,11 +129,12 @@ class Places:
     from_behind: np.ndarray
 
 
-def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
-    """Compute how far from each triangle to look for the source, (t,): the offset of its cage.
+def cage_offsets(mesh: TriMesh, source: Source) -> np.ndarray:
+    """Compute how far from each triangle to look for the source: (t,), the offset of its baking cage.
 
-    This is twice the largest distance of its corners to the source, plus a share of its size for the bulge between
-    them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a part.
+    This is twice the largest distance of the triangle's corners to the source, plus a share of its size for the bulge
+    between them. Distances are capped at the 99th percentile, since a corner may lie far out where remeshing lost a
+    part.
     """
     vertices, faces = mesh.vertices, mesh.faces
     distance = np.linalg.norm(source.nearest.closest(vertices)[1] - vertices, axis=1)
@@ -144,9 +146,9 @@ def vertex_reach(mesh: TriMesh, source: Source) -> np.ndarray:
 
 
 class _Hits(NamedTuple):
-    """Where n rays meet the source: face_idx (n,), -1 for none, distance (n,), barycentric (n, 3).
+    """Hits of n rays on the source: face_idx (n,), -1 without a hit, distance (n,), barycentric (n, 3).
 
-    behind (k,): the rays that stopped at a face met from behind.
+    behind (k,): indices of the rays that stopped at the back of a face.
     """
 
     face_idx: np.ndarray
@@ -164,10 +166,10 @@ def _march(
     start: float,
     through: bool = True,
 ) -> _Hits:
-    """Find the first face on the right side along each ray, within reach.
+    """Find the first face along each ray, within reach (n,), whose normal agrees with normals (n, 3).
 
-    Rays begin `start` before their points. They step through faces on the wrong side. Without `through`, a ray whose
-    first face is met from behind stops there: it has that face, a distance of infinity, and is listed in behind.
+    Rays begin `start` before their points, and pass through faces that do not agree. If not `through`, a ray whose
+    first face is seen from behind stops there. It gets that face and the distance infinity, and is listed in `behind`.
     """
     face, t, barycentric = source.caster.first_hit_single(points - directions * points.dtype.type(start), directions)
     t -= np.float32(start)
@@ -175,7 +177,7 @@ def _march(
     cosine = dot(source.normals_of(face), normals)
     good = near & (cosine > AGREEMENT)
     back = near & (cosine < -AGREEMENT) & (not through)
-    # Hits on the other side of a wall: step through it and continue.
+    # Hits on the other side of a wall: pass through it and continue.
     active = np.flatnonzero(near & ~good & ~back)
     face[~(good | back)] = -1
     distance = np.where(good, np.abs(t), np.float32(np.inf))
@@ -199,10 +201,10 @@ def _march(
 def _nearest_agreeing(
     points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the nearest place whose face agrees with the normal: face_idx (n,), point (n, 3).
+    """Find the nearest point of the source whose face agrees with the normal: face_idx (n,), point (n, 3).
 
-    The plain nearest place is taken where none agrees. It is also taken where it lies within reach (n,) and no place
-    that agrees does: then it is the back of a one-sided sheet.
+    Where no face agrees, the nearest point of all is taken. It is also taken where it lies within reach (n,) and the
+    nearest agreeing point does not: the surface there is the back of a one-sided sheet.
     """
     face, point = source.nearest.closest(points)
     wrong = np.flatnonzero(dot(source.face_normals[face], normals) <= AGREEMENT)
@@ -213,30 +215,31 @@ def _nearest_agreeing(
     sign = np.sign(normals[wrong, axis])
     for k in range(3):
         for s in (-1.0, 1.0):
-            mine = wrong[(axis == k) & (sign == s)]
-            among = source.facing(k, s) if len(mine) else None
+            rows = wrong[(axis == k) & (sign == s)]
+            among = source.facing(k, s) if len(rows) else None
             if among is None:
                 continue
-            other_face, other_point = among.closest(points[mine])
-            apart, other_apart = (np.linalg.norm(at - points[mine], axis=1) for at in (point[mine], other_point))
-            sheet = (apart <= reach[mine]) & (other_apart > reach[mine])
-            better = (dot(source.face_normals[other_face], normals[mine]) > AGREEMENT) & ~sheet
-            face[mine[better]], point[mine[better]] = other_face[better], other_point[better]
+            other_face, other_point = among.closest(points[rows])
+            apart, other_apart = (np.linalg.norm(at - points[rows], axis=1) for at in (point[rows], other_point))
+            sheet = (apart <= reach[rows]) & (other_apart > reach[rows])
+            better = (dot(source.face_normals[other_face], normals[rows]) > AGREEMENT) & ~sheet
+            face[rows[better]], point[rows[better]] = other_face[better], other_point[better]
     return face, point
 
 
-def _slide_off_edges(
+def _prefer_nearest_points(
     points: np.ndarray, normals: np.ndarray, source: Source, met: np.ndarray, face: np.ndarray, barycentric: np.ndarray
 ) -> None:
-    """Take the nearest place, if it agrees, where a ray met a slanted face far away; changes face and barycentric.
+    """Replace a ray's hit by the nearest point, where the hit face is slanted and the two are far apart.
 
-    At a crease that remeshing cut off, the normal leads past the edge, to a place well away from the nearest one. met
-    (n,) bool: which points' places come from rays.
+    At a crease that remeshing cut off, the normal leads past the edge, to a point well away from the nearest one. The
+    nearest point has to agree with the normal. met (n,) bool: the points whose places come from rays. Changes face (n,)
+    and barycentric (n, 3).
     """
     cosine = dot(source.normals_of(face), normals)
     slanted = np.flatnonzero(met & (cosine > AGREEMENT) & (cosine < 0.99))
-    away = source.at(face[slanted], barycentric[slanted], source.vertices) - points[slanted]
-    # Distance from the hit to the nearest place, if the face were a plane.
+    away = source.at(face[slanted], barycentric[slanted], source.mesh.vertices) - points[slanted]
+    # Distance from the hit to the nearest point, if the face were an infinite plane.
     beside = np.sqrt(dot(away, away) * np.maximum(1 - cosine[slanted] ** 2, 0))
     slanted = slanted[beside > 2e-5 * source.extent]
     if not len(slanted):
@@ -245,49 +248,53 @@ def _slide_off_edges(
     agrees = dot(source.face_normals[nearest_face], normals[slanted]) > AGREEMENT
     slanted, nearest_face, nearest = slanted[agrees], nearest_face[agrees], nearest[agrees]
     face[slanted] = nearest_face
-    barycentric[slanted] = barycentric_of(nearest, source.vertices[source.faces[nearest_face]])
+    barycentric[slanted] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[nearest_face]])
 
 
-def _turn_over(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
-    """Move places (k,) on a face with a twin (Source.twins) to the twin; changes face and barycentric."""
+def _move_to_twins(source: Source, places: np.ndarray, face: np.ndarray, barycentric: np.ndarray) -> None:
+    """Move places from faces with a twin (Source.twins) to the twin; changes face (n,) and barycentric (n, 3).
+
+    places (k,): the rows of face and barycentric to move.
+    """
     if not len(places):
         return
     twin = source.twins[face[places]]
     places, twin = places[twin >= 0], twin[twin >= 0]
-    at = source.at(face[places], barycentric[places], source.vertices)
-    face[places], barycentric[places] = twin, barycentric_of(at, source.vertices[source.faces[twin]])
+    at = source.at(face[places], barycentric[places], source.mesh.vertices)
+    face[places], barycentric[places] = twin, barycentric_of(at, source.mesh.vertices[source.mesh.faces[twin]])
 
 
 def reproject(points: np.ndarray, normals: np.ndarray, reach: np.ndarray, source: Source) -> Places:
-    """Find where points (n, 3) with unit normals (n, 3) of the baked mesh lie on the source.
+    """Find the places on the source of points (n, 3) with unit normals (n, 3) of the baked mesh.
 
-    A ray goes along the normal, outward and inward, within reach (n,). The nearest face that faces the same way is
-    taken. Where the ray meets none, the nearest such place in any direction is taken. So nothing is read from the other
+    Rays go along the normal, outward and inward, within reach (n,). The nearest face that faces the same way is taken.
+    Where neither ray meets one, the nearest such point in any direction is taken. So nothing is read from the other
     side of a thin wall. A one-sided sheet is read from behind, and nothing is read through it.
     """
     start = 2e-5 * source.extent
     face, distance, barycentric, behind = _march(points, -normals, normals, reach, source, start, through=False)
-    # Between two sheets that face the same way lies a third: outward there is nothing nearer than so near a hit.
-    rest = np.flatnonzero(distance > 5e-4 * source.extent)
+    # Where the inward hit is very near, no agreeing face is nearer outward: between two sheets that face the same way
+    # lies one that faces the other way.
+    far = np.flatnonzero(distance > 5e-4 * source.extent)
     out_face, out_distance, out_at, _ = _march(
-        points[rest], normals[rest], normals[rest], np.minimum(reach, distance)[rest], source, start
+        points[far], normals[far], normals[far], np.minimum(reach, distance)[far], source, start
     )
-    outward = (out_face >= 0) & (out_distance < distance[rest])
-    face[rest[outward]], distance[rest[outward]], barycentric[rest[outward]] = (
+    outward = (out_face >= 0) & (out_distance < distance[far])
+    face[far[outward]], distance[far[outward]], barycentric[far[outward]] = (
         out_face[outward],
         out_distance[outward],
         out_at[outward],
     )
     # Points behind a one-sided sheet, unless its other side coincides with it.
     behind = behind[np.isinf(distance[behind])]
-    _turn_over(source, behind, face, barycentric)
+    _move_to_twins(source, behind, face, barycentric)
     missed = np.flatnonzero(face < 0)
     if len(missed):
         face[missed], nearest = _nearest_agreeing(points[missed], normals[missed], reach[missed], source)
-        barycentric[missed] = barycentric_of(nearest, source.vertices[source.faces[face[missed]]])
+        barycentric[missed] = barycentric_of(nearest, source.mesh.vertices[source.mesh.faces[face[missed]]])
     by_ray, from_behind = np.ones(len(points), bool), np.zeros(len(points), bool)
     by_ray[missed] = False
-    _slide_off_edges(points, normals, source, by_ray, face, barycentric)
+    _prefer_nearest_points(points, normals, source, by_ray, face, barycentric)
     for rows in (behind, missed):
         from_behind[rows] = dot(source.normals_of(face[rows]), normals[rows]) <= 0
     return Places(face, barycentric, by_ray, from_behind)

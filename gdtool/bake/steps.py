@@ -13,12 +13,11 @@ from gdtool.bake.maps import MapOptions, Maps, make_maps, require_map_memory
 from gdtool.bake.occlusion import bake_occlusion
 from gdtool.bake.origin import Origin
 from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer
-from gdtool.bake.reproject import vertex_reach
-from gdtool.bake.target import Target, Texels, fineness, texel_width, texels_of
+from gdtool.bake.reproject import cage_offsets
+from gdtool.bake.target import Target, Texels, size_and_samples, texel_width, texels_of
 from gdtool.core.errors import InputError
 from gdtool.core.sources import Source
 from gdtool.core.stage import Output
-from gdtool.geometry.meshes import TriMesh
 
 # World units; a source whose detail is finer counts as this fine.
 FINEST_DETAIL = 1e-12
@@ -28,11 +27,12 @@ Report = dict[str, bool | int | float | str]
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Choose what to bake, and how to store it.
+    """Options of a bake and of storing its maps.
 
-    size, samples: of the maps, None where the source's detail decides (target.fineness). occlusion_rays per traced
-    point, drawn by seed; 0: no ambient occlusion. height, confidence: make these maps too. bits per channel. padding in
-    texels; 0: all that are free. normal_map: "auto" leaves a flat one out.
+    size: side of the maps in texels; samples: per texel; None chooses either by the source's detail
+    (target.size_and_samples). occlusion_rays: per traced point, with directions drawn from `seed`; 0 bakes no ambient
+    occlusion. height, confidence: whether to make these maps too. bits: 8 or 16 per channel. padding: width of gutters
+    in texels; 0 fills all free texels. normal_map: "auto" leaves a flat one out.
     """
 
     size: int | None
@@ -49,15 +49,15 @@ class StepOptions:
 def read_source(
     source: Source, choice: SourceChoice, target: Target, matrix: np.ndarray, name: str, out: Output
 ) -> Origin:
-    """Read the surface or model to bake from, and warn where it is inside out beside the target.
+    """Read the surface or model to bake from, and warn where it is inside out compared with the target.
 
-    source is what the mesh was read from; matrix (4, 4) maps the normalised frame to the model's.
+    source: what the mesh was read from; matrix (4, 4): from the normalised frame to the model's.
     """
     origin, turned = read_origin(source, choice, target, matrix)
     for what, why in choice.skipped:
         out.skip(what, why)
     if turned:
-        out.warn(f"{name}: what it is baked from is inside out beside it; the faces are taken the other way round")
+        out.warn(f"{name}: the source of the bake is inside out compared with it; the source's faces are flipped")
     return origin
 
 
@@ -68,10 +68,10 @@ def rasterise(
 
     Returns texels and samples. Raises ResourceError for maps beyond the free memory, InputError without any texel.
     """
-    size, samples = fineness(target, origin.detail, options.size, options.samples)
+    size, samples = size_and_samples(target, origin.detail, options.size, options.samples)
     if options.samples is None and samples == 1:
         times = texel_width(target, size) / max(origin.detail, FINEST_DETAIL)
-        out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one stands for it")
+        out.skip("more samples", f"a texel is {times:.2g} times as wide as the source's detail: one sample is enough")
     require_map_memory(name, size)
     with out.step("rasterise"):
         texels = texels_of(target, size, threads=out.threads)
@@ -83,11 +83,14 @@ def rasterise(
 def bake_maps(
     target: Target, texels: Texels, origin: Origin, samples: int, options: StepOptions, out: Output
 ) -> tuple[Maps, Report]:
-    """Bake the texels' values and occlusion, and make maps of them; also returns the report."""
+    """Bake the texels' values and ambient occlusion, and make maps of them.
+
+    Returns the maps and the report's figures.
+    """
     with out.step("bake"):
-        reach = vertex_reach(TriMesh(target.vertices, target.faces), origin.source)
-        how = BakeOptions(samples, out.threads, options.height, options.confidence)
-        baked = bake(target, texels, origin.source, origin.lookup, reach, how, out.progress)
+        reach = cage_offsets(target.mesh, origin.source)
+        bake_options = BakeOptions(samples, out.threads, options.height, options.confidence)
+        baked = bake(target, texels, origin.source, origin.lookup, reach, bake_options, out.progress)
     occlusion = None
     if options.occlusion_rays:
         with out.step("occlusion"):
@@ -115,7 +118,7 @@ def bake_maps(
 
 
 def add_levels(target: Target, count: int, report: Report, out: Output) -> tuple[Target, ...]:
-    """Make coarser levels of detail until there are `count` with the full one, and add their figures to the report."""
+    """Make coarser levels of detail, `count` with the full mesh, and add their figures to the report."""
     if count < 2:
         return ()
     with out.step("levels of detail"):

@@ -20,7 +20,10 @@ _ROWS_AT_ONCE = 64
 def varying(
     texels: Texels, values: dict[str, np.ndarray], threads: int = 1, tolerance: float = TOLERANCE
 ) -> np.ndarray:
-    """Find the texels (m,) that differ in a stored value by more than tolerance from one of eight neighbours."""
+    """Find the texels (m,) with a value that differs from one of the eight neighbours' by more than `tolerance`.
+
+    Values are compared as maps store them.
+    """
     from gdtool.images.color import srgb_from_linear
 
     size, mask = texels.size, texels.mask()
@@ -65,12 +68,12 @@ def supersample(
     samples: int,
     threads: int = 1,
 ) -> float:
-    """Replace the values (n, …) of varying texels by means over several samples; changes values.
+    """Replace the values (n, …) of varying texels by means over several samples; changes `values`.
 
-    samples is a square number. read(face_idx, barycentric) gives the same values at any places on the target. A sample
-    is read in the triangle that covers its place, and does not count where none does. So a texel gets the mean over the
-    part of it that charts cover; one without a covered sample keeps its value. Color is weighted by alpha, and
-    tangent_normal is made unit again. Returns the share of texels that vary.
+    samples: per texel, a square number. read(face_idx, barycentric) returns values by name at points of the target.
+    Each sample is read in the triangle that covers it; a sample that no triangle covers is left out. So a texel gets
+    the mean over the part of it that charts cover. A texel without a covered sample keeps its value. Color is weighted
+    by alpha, and tangent_normal is scaled to unit length. Returns the share of texels that vary.
     """
     side, size, chosen = int(round(samples**0.5)), texels.size, varying(texels, values, threads)
     barycentrics, texel = Barycentrics(target.uv, target.face_uvs), texels.texel[chosen]
@@ -82,14 +85,14 @@ def supersample(
     owned = list(mapped(owners, offsets, threads))
 
     def run(part: slice) -> None:
-        def taken() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        def sample_values() -> Iterator[tuple[np.ndarray, dict[str, np.ndarray]]]:
             for (along, down), owner in zip(offsets, owned, strict=True):
-                there = np.flatnonzero(owner[part] >= 0)
-                face_idx, at = owner[part][there], texel[part][there]
+                covered = np.flatnonzero(owner[part] >= 0)
+                face_idx, at = owner[part][covered], texel[part][covered]
                 place = np.clip(barycentrics.at(face_idx, (at % size + along) / size, (at // size + down) / size), 0, 1)
-                yield there, read(face_idx, (place / place.sum(1, keepdims=True)).astype(np.float32))
+                yield covered, read(face_idx, (place / place.sum(1, keepdims=True)).astype(np.float32))
 
-        known, means = _means(taken(), part.stop - part.start, values)
+        known, means = _means(sample_values(), part.stop - part.start, values)
         for name, mean in means.items():
             values[name][chosen[part][known]] = mean
 
@@ -100,27 +103,27 @@ def supersample(
 
 
 def _means(
-    taken: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]
+    sample_values: Iterable[tuple[np.ndarray, dict[str, np.ndarray]]], count: int, like: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Average samples of `count` texels: returns the texels that have any (m,), and their means (m, …) by name.
+    """Average samples of `count` texels: returns the texels with any sample (m,), and the means (m, …) by name.
 
-    taken yields, for the first sample of all texels, then the second and so on, the texels (k,) that have it and the
-    values read there. like names the values.
+    sample_values: yields once for each sample position in a texel: the texels (k,) that are covered there, and their
+    values (k, …) by name. like: values with the names and shapes to average.
     """
     total = {name: np.zeros((count, *value.shape[1:]), np.float32) for name, value in like.items()}
-    samples, shown = np.zeros(count, np.float32), np.zeros(count, np.float32)
-    for there, read in taken:
-        samples[there] += 1
+    samples, alpha_sum = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    for covered, read in sample_values:
+        samples[covered] += 1
         if "alpha" in read:
-            seen = np.maximum(read["alpha"], np.float32(1e-4))
-            shown[there] += seen
-            read["albedo"] = read["albedo"] * seen[:, None]
+            alpha = np.maximum(read["alpha"], np.float32(1e-4))
+            alpha_sum[covered] += alpha
+            read["albedo"] = read["albedo"] * alpha[:, None]
         for name, sums in total.items():
-            sums[there] += read[name]
+            sums[covered] += read[name]
     known = np.flatnonzero(samples)
     out = {}
     for name, sums in total.items():
-        weight = (shown if name == "albedo" and "alpha" in total else samples)[known]
+        weight = (alpha_sum if name == "albedo" and "alpha" in total else samples)[known]
         mean = sums[known] / weight.reshape(-1, *[1] * (sums.ndim - 1))
         out[name] = unit(mean) if name == "tangent_normal" else mean
     return known, out

@@ -15,8 +15,8 @@ from gdtool.geometry.tangents import corner_tangents, edge_pairs, tangent_frames
 from gdtool.geometry.uv_raster import Barycentrics, between_centres, centres_in, extend_owners, owners_of
 
 CREASE_DEGREES = 45.0  # smooth normals are split along edges that bend more
-# Texels that are worked on at once: few enough to stay near the cache. And enough for libigl, which holds Python's lock
-# while it searches nearest points, to use all cores: it does so from 10,000 points on.
+# Texels in one batch: few enough for the cache, and enough for libigl to use all cores, as it does from 10,000 points
+# on. It holds Python's lock while it searches for nearest points.
 TEXELS_AT_ONCE = 65_536
 # A texel wider than this many times the source's detail needs more than one sample (docs/numerics.md).
 COARSE_TEXEL = 3.0
@@ -56,7 +56,7 @@ def corner_normals(mesh: TriMesh, crease_degrees: float = CREASE_DEGREES) -> np.
 
 
 class SurfaceModes(Protocol):
-    """How viewers show a surface; bake.origin.Origin is one."""
+    """The glTF material settings alpha mode, alpha cutoff and double-sided; bake.origin.Origin has them."""
 
     alpha_mode: str
     alpha_cutoff: float
@@ -74,12 +74,11 @@ class CornerNormals(NamedTuple):
 class Target:
     """Triangles with texture coordinates and the frames that a normal map is encoded in.
 
-    vertices (v, 3), faces (t, 3); uv (c, 2) with (0, 0) at the image's top left, face_uvs (t, 3) into uv; normals
-    (t, 3, 3) unit and tangents (t, 3, 4) of the corners.
+    mesh: vertices (v, 3), faces (t, 3). uv (c, 2), with (0, 0) at the image's top left; face_uvs (t, 3) into uv.
+    normals (t, 3, 3) unit and tangents (t, 3, 4) of the triangles' corners.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     uv: np.ndarray
     face_uvs: np.ndarray
     normals: np.ndarray
@@ -94,16 +93,15 @@ class Target:
         crease_degrees: float = CREASE_DEGREES,
     ) -> Target:
         """Make the target of a triangle mesh: smooth normals split at creases, and MikkTSpace tangents."""
-        vertices, faces = mesh.vertices, mesh.faces
         normals = corner_normals(mesh, crease_degrees)
-        normal_idx = np.arange(len(faces) * 3).reshape(-1, 3)
+        normal_idx = np.arange(len(mesh.faces) * 3).reshape(-1, 3)
         tangents = corner_tangents(mesh, normals.reshape(-1, 3), uv, face_uvs, normal_idx)
-        return cls(vertices, faces, uv, face_uvs, normals, tangents)
+        return cls(mesh, uv, face_uvs, normals, tangents)
 
     @cached_property
     def packed(self) -> np.ndarray:
-        """Corners of the triangles as (3, 10, t) float32: position, normal, tangent and its handedness."""
-        corners = np.concatenate([self.vertices[self.faces], self.normals, self.tangents], -1)
+        """Gather the corners of the triangles as (3, 10, t) float32: position, normal, tangent and its handedness."""
+        corners = np.concatenate([self.mesh.vertices[self.mesh.faces], self.normals, self.tangents], -1)
         return np.ascontiguousarray(corners.transpose(1, 2, 0), np.float32)
 
 
@@ -125,13 +123,13 @@ class Texels:
         return len(self.texel)
 
     def mask(self, inside_only: bool = False) -> np.ndarray:
-        """Make an image (size, size) bool of these texels."""
+        """Make an image (size, size) bool that is True at these texels."""
         out = np.zeros(self.size * self.size, bool)
         out[self.texel[: self.inside] if inside_only else self.texel] = True
         return out.reshape(self.size, self.size)
 
     def image(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        """Make an image (size, size, …) of values (n, …) of these texels, fill elsewhere."""
+        """Make an image (size, size, …) of values (n, …) of these texels; other texels are `fill`."""
         out = np.zeros((self.size * self.size, *values.shape[1:]), values.dtype)
         if fill:
             out[:] = fill
@@ -171,7 +169,7 @@ def texels_of(target: Target, size: int, rings: int = 2, threads: int = 1) -> Te
 def surface_at(
     target: Target, face_idx: np.ndarray, barycentric: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Interpolate positions, normals, tangents (n, 3) and handedness (n,) at places on the target, float32.
+    """Interpolate positions, normals, tangents (n, 3) and handedness (n,) at points of the target, float32.
 
     Normals and tangents are not made unit, as viewers interpolate them (see tangents.tangent_frames). Each component is
     contiguous in memory, so that sums over components are fast.
@@ -191,29 +189,36 @@ def surface_at(
 
 
 def points_at(target: Target, face_idx: np.ndarray, barycentric: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate positions (n, 3) and tangent frames (n, 3, 3), columns tangent, bitangent, normal."""
+    """Interpolate positions (n, 3) and tangent frames (n, 3, 3) at points of the target.
+
+    The columns of a frame are tangent, bitangent and normal.
+    """
     points, normal, tangent, sign = surface_at(target, face_idx, barycentric)
     return points, tangent_frames(normal, tangent, sign)
 
 
 def texel_width(target: Target, size: int) -> float:
     """Compute the mean width of a texel of a size x size map on the target, in its units: √(area / texels)."""
-    area = face_normals(TriMesh(target.vertices, target.faces))[1].sum()
+    area = target.mesh.area
     u, v = (target.uv[target.face_uvs[:, k]] - target.uv[target.face_uvs[:, 0]] for k in (1, 2))
     covered = 0.5 * np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum()
     return float(np.sqrt(area / max(covered, 1e-12)) / size)
 
 
 def size_for(target: Target, detail: float, least: int = 256, most: int = 4096) -> int:
-    """Choose the power of two at which a texel spans at most 1.1 detail (in the target's units), within bounds."""
+    """Choose the side of the maps: the least power of two whose texels span at most 1.1 `detail`, within bounds.
+
+    detail: width of the source's finest detail, in the target's units.
+    """
     wanted = texel_width(target, 1) / max(detail, 1e-9) / 1.1
     return int(np.clip(2 ** np.ceil(np.log2(max(wanted, 1))), least, most))
 
 
-def fineness(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
-    """Choose the size of the maps, and the samples of a texel where the source varies, for a source of that detail.
+def size_and_samples(target: Target, detail: float, size: int | None, samples: int | None) -> tuple[int, int]:
+    """Choose the side of the maps in texels, and the samples per texel where the source varies.
 
-    A given size or number of samples is kept, samples rounded to a square number.
+    detail: width of the source's finest detail, in the target's units. A size or number of samples that is not None is
+    kept; samples are rounded to a square number.
     """
     size = size or size_for(target, detail)
     if samples is None:
@@ -222,5 +227,8 @@ def fineness(target: Target, detail: float, size: int | None, samples: int | Non
 
 
 def samples_for(width: float, detail: float) -> int:
-    """Choose the samples of a texel of some width where a source with detail of some width varies, in one unit."""
+    """Choose the samples per texel: 4 where a texel is more than COARSE_TEXEL times as wide as the detail, else 1.
+
+    width, detail: both in the same unit.
+    """
     return 4 if width > COARSE_TEXEL * detail else 1

@@ -37,8 +37,9 @@ def write_usd(
 ) -> None:
     """Write a .usda, or a .usdz that packs it with its maps.
 
-    files: file name, beside path, by map name. convention: "opengl" or "directx", of normal.png. Units and axes are
-    glTF's: metres, Y up, right-handed. Raises OutputError when the package cannot be written.
+    files: file name, beside path, by map name. convention: "opengl" or "directx", the direction of the green channel of
+    normal.png. Units and axes are glTF's: metres, Y up, right-handed. Raises OutputError when the package cannot be
+    written.
     """
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
@@ -58,10 +59,11 @@ def write_usd(
     prim.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
     prim.CreateDoubleSidedAttr(surface.double_sided)
     primvars = UsdGeom.PrimvarsAPI(prim)
-    uv = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], 1).astype(np.float32)  # (0, 0) is the image's bottom left
+    uv, face_uvs = mesh.texture_coordinates()
+    uv = np.stack([uv[:, 0], 1 - uv[:, 1]], 1).astype(np.float32)  # (0, 0) is the image's bottom left
     st = primvars.CreatePrimvar("st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying)
     st.Set(Vt.Vec2fArray.FromNumpy(uv))
-    st.SetIndices(Vt.IntArray.FromNumpy(mesh.face_uvs.ravel()[corner].astype(np.int32)))
+    st.SetIndices(Vt.IntArray.FromNumpy(face_uvs.ravel()[corner].astype(np.int32)))
     shading = primvars.CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying)
     shading.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(corners.normals, np.float32)))
     shading.SetIndices(Vt.IntArray.FromNumpy(corners.idx.ravel()[corner].astype(np.int32)))
@@ -79,7 +81,7 @@ def write_usd(
 
 
 def _material(stage, maps: Maps, files: dict[str, str], convention: str, modes: SurfaceModes):
-    """Define a UsdPreviewSurface, with a texture for each map and plain values where a map is constant."""
+    """Define a UsdPreviewSurface with a texture for each map, and with plain values where a map is constant."""
     from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames

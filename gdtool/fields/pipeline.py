@@ -83,8 +83,7 @@ class AlignedViews:
 class Surface:
     """A closed mesh, and where networks were fitted the fit and its figures."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     fit: Fit | None = None
     figures: dict[str, float] = field(default_factory=dict)
 
@@ -217,7 +216,7 @@ def fit_paper(views: ViewImages, aligned: AlignedViews, shape: Shape, options: P
             views.cameras,
             views.mask,
             images,
-            TriMesh(shape.vertices, shape.faces),
+            shape.mesh,
             replace(options, volume_steps=volume),
             lambda count, label: out.progress(range(count), count, label),
         )
@@ -227,8 +226,8 @@ def fit_paper(views: ViewImages, aligned: AlignedViews, shape: Shape, options: P
             mesh = keep_pieces(mesh, shape.step)
     if not is_closed_manifold(mesh.faces):
         out.warn("the networks' surface is not closed; the grid's is kept")
-        return Surface(shape.vertices, shape.faces, None, figures)
-    return Surface(mesh.vertices, mesh.faces, fit, figures)
+        return Surface(shape.mesh, None, figures)
+    return Surface(mesh, fit, figures)
 
 
 def use_fit(surface: Surface, views: ViewImages, look: Appearance, out: Output) -> None:
@@ -236,7 +235,7 @@ def use_fit(surface: Surface, views: ViewImages, look: Appearance, out: Output) 
     networks."""
     from gdtool.fields.neural.paper import light_record, network_materials, save_field
 
-    values = network_materials(surface.fit.material, surface.vertices, out.device)
+    values = network_materials(surface.fit.material, surface.mesh.vertices, out.device)
     supervised = [name for name in MATERIALS if name in views.images]
     for name in supervised or MATERIALS if "color" in views.images else supervised:
         setattr(look, name, values[name] if name == "albedo" else values[name][:, 0])
@@ -246,23 +245,22 @@ def use_fit(surface: Surface, views: ViewImages, look: Appearance, out: Output) 
 
 
 def find_materials(
-    views: ViewImages, mesh: Surface, step: float, light: dict[str, Any] | None, seed: int, out: Output
+    views: ViewImages, surface: Surface, step: float, light: dict[str, Any] | None, seed: int, out: Output
 ) -> tuple[np.ndarray, Appearance]:
-    """Find the normals (v, 3) of the mesh's vertices, and their materials and light.
+    """Find the normals (v, 3) of the surface's vertices, and their materials and light.
 
     step: of the grid, world units. light: the record of the views' light, where it is known.
     """
     from gdtool.fields.appearance.appearance import AppearanceOptions, appearance
 
     with out.step("materials"):
-        triangles = TriMesh(mesh.vertices, mesh.faces)
-        normals = vertex_normals(triangles)
+        normals = vertex_normals(surface.mesh)
         options = AppearanceOptions(step, light, seed)
-        look = appearance(views.cameras, views.mask, views.images, triangles, normals, options)
+        look = appearance(views.cameras, views.mask, views.images, surface.mesh, normals, options)
     for what, reason in look.skipped:
         out.skip(what, reason)
-    if mesh.fit is not None:
-        use_fit(mesh, views, look, out)
+    if surface.fit is not None:
+        use_fit(surface, views, look, out)
     return normals, look
 
 

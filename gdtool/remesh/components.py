@@ -1,4 +1,7 @@
-"""Remesh a mesh of several pieces: small ones apart from large ones, failed ones one by one."""
+"""Remesh a mesh of several connected pieces.
+
+Small pieces are remeshed apart from large ones. Pieces whose quads are rejected are remeshed again, one by one.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +33,9 @@ _MAX_PIECE_EDGES = 1.5  # edge lengths that an accepted piece may stray
 
 
 def split_small_pieces(patch: RemeshPatch) -> tuple[RemeshPatch | None, RemeshPatch]:
-    """Return the small pieces as one patch (None where there are none) and the large ones as another.
+    """Split a patch into one of its small pieces (None where there are none) and one of its large pieces.
 
-    Each gets its share of the quads by area; small pieces get enough for their shape.
+    Each gets its share of the quads by area; small pieces get enough to keep their shape.
     """
     (count, piece), quads = patch.pieces, patch.quads
     share = patch.piece_areas / patch.piece_areas.sum()
@@ -48,10 +51,10 @@ def split_small_pieces(patch: RemeshPatch) -> tuple[RemeshPatch | None, RemeshPa
 
 
 def accept_good_pieces(patch: RemeshPatch, whole: Candidate | None) -> tuple[QuadResult | None, np.ndarray]:
-    """Keep the pieces of an engine's result that pass judgement each by itself, finalized.
+    """Judge each piece of an engine's result by itself; return the finalized quads of the good pieces.
 
-    whole: the engine's quads of all pieces. Returns the accepted quads, None where there are none, and (pieces,) bool:
-    the accepted pieces.
+    whole: the engine's quads of all pieces. The result is None where no piece is good. Also returns (pieces,) bool: the
+    accepted pieces.
     """
     (count, piece), good = patch.pieces, np.zeros(patch.pieces[0], bool)
     if whole is None or count > patch.quads / SMALL_PIECE_QUADS:
@@ -84,18 +87,21 @@ def accept_good_pieces(patch: RemeshPatch, whole: Candidate | None) -> tuple[Qua
     if not good.any():
         return None, good
     result = QuadResult(concatenate_meshes([made[k] for k in np.flatnonzero(good)]), whole.attempt.label)
-    rest = patch.quads * patch.piece_areas[~good].sum() / patch.piece_areas.sum()
-    if abs(patch.quads - len(result.mesh.faces) - rest) > max(COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * rest):
+    missing_quads = patch.quads * patch.piece_areas[~good].sum() / patch.piece_areas.sum()
+    if abs(patch.quads - len(result.mesh.faces) - missing_quads) > max(
+        COUNT_TOLERANCE * patch.quads, _MAX_MAKE_UP * missing_quads
+    ):
         return None, np.zeros_like(good)  # the other pieces could not make up for this count
     return result, good
 
 
 def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[RemeshPatch]:
-    """Return patches for the pieces that are not done: one for each large piece, one for all small ones together.
+    """Make patches of the pieces that are not done: one of each large piece, one of all small pieces together.
 
-    done (pieces,) bool; quads: how many are left for them. The patch of small pieces skips engines. An engine may do
-    better on one piece alone: it can join pieces that lie close together, and lose thin pieces beside others. It meets
-    small counts less well, so the tolerance is shared such that the sum of all pieces still holds.
+    done (pieces,) bool; quads: how many are left for these pieces. The patch of small pieces skips engines. An engine
+    often does better on a single piece: among several, it can join pieces that lie close together, and lose thin ones.
+    It meets small counts less well, so each piece gets a share of the tolerance such that the sum of all pieces still
+    holds.
     """
     if done.all():
         return []
@@ -106,11 +112,11 @@ def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[
     alone = np.argsort(-share, kind="stable")[:_MAX_ALONE]
     counts = np.maximum(quads * share, least)[alone]
     large = (share[alone] > 0) & (counts >= _MIN_QUADS_ALONE)
-    alone, counts, rest = alone[large], counts[large], ~done
-    rest[alone] = False
+    alone, counts, is_small = alone[large], counts[large], ~done
+    is_small[alone] = False
     patches = []
-    if rest.any():
-        patches.append(patch.subset(rest[piece], max(int(quads * share[rest].sum()), 1), skip_engines=True))
+    if is_small.any():
+        patches.append(patch.subset(is_small[piece], max(int(quads * share[is_small].sum()), 1), skip_engines=True))
         quads -= split_count(patches[0].mesh.faces, patches[0].quads)
     counts = np.maximum((counts * (quads / max(counts.sum(), 1))).round().astype(int), _MIN_PIECE_QUADS)
     spare = max(COUNT_TOLERANCE * patch.quads - _MIN_TOLERANCE * counts.sum(), 0)
@@ -122,9 +128,9 @@ def remaining_patches(patch: RemeshPatch, done: np.ndarray, quads: int) -> list[
 
 
 def quads_by_piece(mesh: QuadMesh, patch: RemeshPatch) -> list[QuadMesh]:
-    """Return the quads of each piece: the connected components of a quad mesh that lie on it.
+    """Split a quad mesh by the piece of the patch's surface that its connected components lie on.
 
-    A component that lies on two pieces belongs to neither.
+    A component that lies on two pieces is left out.
     """
     vertices, quads = mesh.vertices, mesh.faces
     (count, piece), (components, label) = patch.pieces, topology.components(quads)
@@ -136,7 +142,7 @@ def quads_by_piece(mesh: QuadMesh, patch: RemeshPatch) -> list[QuadMesh]:
 
 
 def concatenate_meshes(meshes: list[QuadMesh]) -> QuadMesh:
-    """Return several meshes as one."""
+    """Concatenate several meshes into one."""
     offset = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
     return QuadMesh(
         np.concatenate([mesh.vertices for mesh in meshes]),

@@ -1,4 +1,4 @@
-"""Find how many quads a surface needs: the count of a quad size, and the coarsest mesh within a distance."""
+"""Find how many quads a surface needs for a quad size, or for a largest distance from the surface."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MakeQuads = Callable[[TriMesh, Request], tuple[QuadMesh, Record]]  # as pipeline
 
 
 class BudgetedQuads(NamedTuple):
-    """Quads, the record of how they were made, and the distance from the surface that they reach."""
+    """Quads, the record of how they were made, and their largest distance from the surface."""
 
     mesh: QuadMesh
     record: Record
@@ -32,12 +32,12 @@ class BudgetedQuads(NamedTuple):
 
 
 def quads_of_size(mesh: TriMesh, size: float) -> int:
-    """Return how many quads with sides of `size` cover the triangles: their area over size squared."""
+    """Count the quads with sides of length `size` that cover the triangles: their area over size squared."""
     return round(mesh.area / size**2)
 
 
 def is_finished(quads: np.ndarray, count: int) -> bool:
-    """Whether quads (q, 4) already are about `count`, closed and manifold, so that nothing is left to do."""
+    """Return whether quads (q, 4) need no remeshing: closed, manifold, and about `count` of them."""
     return (
         abs(len(quads) / count - 1) <= COUNT_TOLERANCE and topology.is_watertight(quads) and topology.is_manifold(quads)
     )
@@ -53,7 +53,7 @@ def coarsest_within(
 
     The distance is the largest from the vertices of either mesh to the other surface (simplify.deviation). It falls
     about as one over the number of quads, which predicts the next count to try. When even request.quads are too few,
-    those are returned. make_quads: None is remesh itself.
+    these are returned. make_quads: the function that remeshes; None is pipeline.remesh.
     """
     too_few, quads = min(_MIN_QUADS, request.quads) / _SAME_COUNT, request.quads
     enough: tuple[int, BudgetedQuads] | None = None

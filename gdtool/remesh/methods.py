@@ -26,10 +26,10 @@ Step = Callable[[str], AbstractContextManager]
 
 @dataclass(frozen=True)
 class Goal:
-    """What a mesh is made for.
+    """The faces that a mesh is to get.
 
-    triangles: how many to decimate to, 0 for quads. max_deviation: distance from the surface within which the fewest
-    quads are sought, 0 for request.quads. symmetry: "none", "auto", or the axis across which halves are mirrored.
+    triangles: how many to decimate to, 0 for quads. max_deviation: largest distance from the surface; the fewest quads
+    within it are sought; 0 makes request.quads. symmetry: "none", "auto", or the axis across which halves are mirrored.
     """
 
     request: Request
@@ -40,7 +40,7 @@ class Goal:
 
 @dataclass
 class MadeMesh:
-    """A mesh, the record of how it was made, sentences to warn of, and (what, why) of skipped work."""
+    """A mesh, the record of how it was made, warnings, and (what, why) of skipped work."""
 
     mesh: QuadMesh
     record: Record
@@ -49,7 +49,7 @@ class MadeMesh:
 
 
 def make_mesh(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
-    """Make the faces of a clean triangle mesh in a unit box.
+    """Make the faces of a clean triangle mesh in a unit box: decimated triangles, or quads.
 
     step: a context manager that times a named step.
     """
@@ -57,12 +57,12 @@ def make_mesh(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
 
 
 def passed_through(mesh: QuadMesh) -> MadeMesh:
-    """Return quads that are taken from the input as they are."""
+    """Return the input's quads unchanged."""
     return MadeMesh(mesh, Record(engine=PASSED_THROUGH))
 
 
 def repair_warnings(repairs: dict[str, int | bool], closed: bool) -> list[str]:
-    """Return sentences on what repair.clean() repaired, and on an open surface."""
+    """Describe what repair.clean() repaired, and an open surface, as sentences for warnings."""
     warnings = []
     if repairs:
         names = {name: name.replace("_", " ") for name in repairs}
@@ -76,7 +76,7 @@ def repair_warnings(repairs: dict[str, int | bool], closed: bool) -> list[str]:
 
 
 def report_figures(made: MadeMesh, mesh: TriMesh) -> dict:
-    """Return the report: the record's figures, topology, shape, and distances to the triangles that were remeshed."""
+    """Compute the report: the record's figures, topology, shape, and distances to the triangles that were remeshed."""
     figures = made.record.figures | mesh_quality.topology_figures(made.mesh) | mesh_quality.shape_figures(made.mesh)
     if made.record.engine != PASSED_THROUGH:
         source = made.record.source
@@ -90,9 +90,9 @@ def report_figures(made: MadeMesh, mesh: TriMesh) -> dict:
 
 
 def count_warning(made: MadeMesh, faces: np.ndarray, goal: Goal) -> str | None:
-    """Return a sentence on why there are more or fewer faces than requested; None where the count is right.
+    """Explain in a sentence why there are more or fewer faces than requested; None where the count is met.
 
-    faces (f, 3): the triangles that were remeshed. Fewer triangles than --triangles are right.
+    faces (f, 3): the triangles that were remeshed. Fewer triangles than goal.triangles are fine.
     """
     count = len(made.mesh.faces)
     asked = goal.triangles or (count if goal.max_deviation else goal.request.quads)
@@ -140,7 +140,7 @@ def _quads(mesh: TriMesh, goal: Goal, step: Step) -> MadeMesh:
 def _with_symmetry(
     mesh: TriMesh, goal: Goal, step: Step
 ) -> tuple[MakeQuads, dict[str, float | str], list[tuple[str, str]]]:
-    """Return the function that makes the quads, figures of the mirror plane, and what is skipped and why."""
+    """Find the mirror plane, and return the function that makes the quads, figures of the plane, and skipped work."""
     if goal.symmetry == "none":
         return remesh, {}, []
     with step("find the mirror plane"):

@@ -36,18 +36,18 @@ from gdtool.remesh.task import QuadResult, Record, RemeshPatch, Request
 
 _PIECE_GAP_EDGES = 8.0  # edge lengths between separated pieces: no step looks at the surface farther away than this
 _MIN_QUADS_PER_HANDLE = 100  # with fewer, engines lose some handles (benchmarks/remesh/nets.py)
-# Times the noise that keeps triangles of one size: it moves few corners farther than this off the surface, so what is
-# farther was moved on purpose, to a restored crease.
+# A multiple of the noise (JITTER_EDGES) that keeps triangles of one size while simplifying. It moves few vertices
+# farther than this off the surface, so those farther away were moved to a restored crease.
 _NOISE_REACH = 3.0
 _MAX_CREASE_EDGE = 0.75  # of the quads' edge: bevels of triangles larger than this are kept as bevels
 _TRIANGLES_PER_QUAD, _MIN_TRIANGLES = 3, 20000  # triangles that show all that the quads can
 
 
 def remesh(mesh: TriMesh, request: Request) -> tuple[QuadMesh, Record]:
-    """Return quads of the surface of a clean triangle mesh (repair.clean), and the record of how they were made.
+    """Remesh a clean triangle mesh (repair.clean) to quads; return them and the record of how they were made.
 
     mesh: in a unit box. No face of the result is a triangle. The result is closed and manifold where the input is.
-    Pieces that nearly touch are moved apart meanwhile, so that no quads are fitted to a neighbouring piece.
+    Pieces that nearly touch are moved apart while it runs, so that no quads are fitted to a neighbouring piece.
     """
     if len(mesh.faces) > _triangles_needed(request):
         prepare(collapse_in_child, CHILD_MODULES)
@@ -72,7 +72,7 @@ class _Remesher:
         self.full_surface = cache(lambda: ProjectionTarget(self.mesh))
 
     def run(self) -> tuple[QuadMesh, Record]:
-        """Return the quads and the record."""
+        """Make the quads and the record."""
         small, large = split_small_pieces(self._simplified_patch())
         # Small pieces cannot always be made of as few quads as requested: the large ones make up for the count.
         if small is None:
@@ -96,7 +96,8 @@ class _Remesher:
     def _simplified_patch(self) -> RemeshPatch:
         """Simplify the mesh to what the quads need, creases restored.
 
-        Where the result strays too far, simplify again with the collapse that keeps the topology.
+        Where the result is more than an edge length from the surface, simplify again with the collapse that keeps the
+        topology.
         """
         for topology_first in (False, True):
             start = time.perf_counter()
@@ -121,7 +122,7 @@ class _Remesher:
 
 
 def _quads_of(patch: RemeshPatch, record: Record) -> list[QuadResult]:
-    """Return the quads of a patch, as one result or as one for each way that its pieces were made."""
+    """Make the quads of a patch, as one result or as several of its pieces."""
     if _uses_engines(patch, record):
         search = EngineSearch(patch, record)
         if (result := search.run()) is not None:
@@ -140,7 +141,7 @@ def _quads_of(patch: RemeshPatch, record: Record) -> list[QuadResult]:
 
 
 def _uses_engines(patch: RemeshPatch, record: Record) -> bool:
-    """Whether engines are tried on a patch; a reason against it that the caller could not know goes to the record."""
+    """Return whether to try engines on a patch; if not, record the reason unless the request asked for it."""
     if patch.skip_engines or patch.quads < SMALL_PIECE_QUADS or patch.request.engine == "split":
         return False
     why, pieces = None, patch.pieces[0]
@@ -155,14 +156,14 @@ def _uses_engines(patch: RemeshPatch, record: Record) -> bool:
 
 
 def _triangles_needed(request: Request) -> int:
-    """How many triangles show all that the requested quads can."""
+    """Return the number of triangles that show all that the requested quads can."""
     return max(_TRIANGLES_PER_QUAD * request.quads, _MIN_TRIANGLES)
 
 
 def _while_simplifying(request: Request, full_surface: Callable[[], ProjectionTarget]) -> None:
-    """Do what comes next while a child simplifies: start the engines' children, build the search tree, import.
+    """Prepare the next steps while a child simplifies: start engines' children, build the search tree, import modules.
 
-    Not before the child works: starting the engines slows what this process does alone, and building the tree holds the
+    This waits until the child works: starting the engines slows this process, and building the tree holds the
     interpreter's lock.
     """
     prepare_engines(request)
@@ -172,7 +173,7 @@ def _while_simplifying(request: Request, full_surface: Callable[[], ProjectionTa
 
 
 def _simplified(run: _Remesher, topology_first: bool) -> TriMesh:
-    """Return the triangles, creases restored, simplified to what the quads need; the input where that fails."""
+    """Simplify the triangles to what the quads need, creases restored; return the input where that fails."""
     request, record = run.request, run.record
     if len(run.mesh.faces) <= _triangles_needed(request):
         prepare_engines(request)

@@ -13,10 +13,13 @@ _MAX_PIECES = 1000  # more pieces stay where they are: all pairs of boxes are co
 
 
 class SeparatedPieces:
-    """A mesh whose pieces were moved apart."""
+    """A mesh whose pieces were moved apart, and the offsets that move them back."""
 
     def __init__(self, mesh: TriMesh, piece: np.ndarray, offset: np.ndarray):
-        """piece (f,): the piece of each face. offset (pieces, 3): how far each piece moves."""
+        """Move each piece of a mesh by its offset.
+
+        piece (f,): the piece of each face. offset (pieces, 3): how far each piece moves.
+        """
         self._piece, self._offset = piece, offset
         piece_of_vertex = np.zeros(len(mesh.vertices), np.int64)
         piece_of_vertex[mesh.faces.ravel()] = np.repeat(piece, 3)

@@ -28,9 +28,10 @@ AXES = "xyz"
 def mirror_plane(mesh: TriMesh, quads: int, axes: str = AXES, limit: int = 8000) -> tuple[int | None, dict[str, float]]:
     """Find the axis (0, 1, 2) across whose plane through the origin the mesh is its own mirror image.
 
-    mesh: in a unit box about the origin; quads: how many will be made; axes: those to try; limit: vertices measured at
-    most. Returns the best axis, None where no half is near enough to the other's mirror image, and for each axis the
-    largest distance from a reflected vertex to the surface. Differences finer than a quarter of a quad do not count.
+    mesh: in a unit box about the origin; quads: how many will be made; axes: those to try; limit: the most vertices to
+    measure. Returns the best axis, or None where no axis mirrors the mesh closely enough. Also returns for each axis
+    the largest distance from a reflected vertex to the surface. Differences finer than a quarter of a quad do not
+    count.
     """
     edge = (mesh.area / quads) ** 0.5
     surface = ProjectionTarget(mesh)
@@ -81,8 +82,8 @@ def half_mesh(mesh: TriMesh, axis: int) -> TriMesh:
 def join_with_mirror(mesh: QuadMesh, axis: int, edge: float, surface: ProjectionTarget | None = None) -> QuadMesh:
     """Join a half of quads and its reflection into one mesh.
 
-    Boundary vertices near the plane move onto it and are shared. Quads that this folds are untangled on `surface`,
-    where it is given. edge: length of the quads' sides.
+    Boundary vertices near the plane move onto it and are shared. Quads that fold in this way are untangled on
+    `surface`, unless it is None. edge: length of the quads' sides.
     """
     vertices, quads = mesh.vertices, mesh.faces
     edges = topology.edges_of(quads)
@@ -112,10 +113,10 @@ def join_with_mirror(mesh: QuadMesh, axis: int, edge: float, surface: Projection
 
 
 def remesh_mirrored(mesh: TriMesh, request: Request, axis: int) -> tuple[QuadMesh, Record]:
-    """Remesh as pipeline.remesh does, the quads being their own mirror image across `axis`.
+    """Remesh as pipeline.remesh does, with quads that are their own mirror image across the axis.
 
     The plane goes through the origin. Where the halves do not close, the whole is remeshed without symmetry, and the
-    figure "symmetry" of the record is "none".
+    record's figure "symmetry" is "none".
     """
     edge = (mesh.area / request.quads) ** 0.5
     sharp, moved = mesh, None
@@ -145,7 +146,7 @@ def remesh_mirrored(mesh: TriMesh, request: Request, axis: int) -> tuple[QuadMes
 
 
 def _seam_fault(joined: QuadMesh, faces: np.ndarray, request: Request) -> str | None:
-    """Return what is wrong with the joined halves of a surface with triangles (f, 3), None where nothing is."""
+    """Return what is wrong with the joined halves of a surface with triangles (f, 3); None where they are sound."""
     quads = joined.faces
     if topology.is_watertight(faces):
         if not topology.is_watertight(quads):

@@ -42,7 +42,7 @@ _FACES_OF_A_HANDLE = 40
 
 @dataclass(frozen=True)
 class Request:
-    """What the caller asks for: about `quads` quads that follow creases sharper than `crease_degrees`.
+    """The caller's request: about `quads` quads that follow creases sharper than `crease_degrees`.
 
     `seconds` limits the whole run, counted from when the request is made; `memory_mb` limits one child process.
     """
@@ -59,22 +59,22 @@ class Request:
 
     @property
     def engine_seconds_left(self) -> float:
-        """Seconds in which engines may still start; 0 or less when the time for engines is over."""
+        """Return the seconds in which engines may still start; 0 or less when the time for engines is over."""
         return self.started + _ENGINES_SHARE * self.seconds - time.monotonic()
 
     @property
     def child_seconds(self) -> float:
-        """Time limit of one engine's child process, in seconds."""
+        """Return the time limit of one engine's child process, in seconds."""
         return max(self.engine_seconds_left, _MIN_CHILD_SECONDS)
 
     @property
     def fallback_seconds(self) -> float:
-        """Seconds for steps without which there is no result: what is left of the whole, and never too few."""
+        """Return the seconds for the steps that a result needs: what is left, but at least _MIN_FALLBACK_SECONDS."""
         return max(self.started + self.seconds - time.monotonic(), _MIN_FALLBACK_SECONDS)
 
 
 class QuadResult(NamedTuple):
-    """Quads of a patch, and the method that made them as the manifest names it."""
+    """Quads of a patch, and the manifest's name of the method that made them."""
 
     mesh: QuadMesh
     method: str
@@ -82,7 +82,11 @@ class QuadResult(NamedTuple):
 
 @dataclass
 class Record:
-    """What a run did: the engine taken, what failed before and why, figures for the report, seconds by step."""
+    """The record of a run, for the manifest.
+
+    engine: the one whose quads were taken. failed: what failed before, and why. figures: for the report. seconds: by
+    step.
+    """
 
     engine: str = ""
     failed: list[str] = field(default_factory=list)
@@ -98,14 +102,14 @@ class Record:
 def count_reason(
     faces: np.ndarray, made: int, asked: int, tried: list[str], min_of_a_piece: int = QUADS_OF_A_PIECE
 ) -> str:
-    """Return a sentence on why a mesh has `made` faces instead of the `asked` ones, as far as that is known.
+    """Explain in a sentence, as far as that is known, why a mesh has `made` faces instead of `asked`.
 
-    faces (f, 3): the manifold they were made from. tried: what failed on the way. min_of_a_piece: the fewest faces of
-    a piece.
+    faces (f, 3): the manifold that the faces were made from. tried: what failed before. min_of_a_piece: the fewest
+    faces of a piece.
     """
     pieces = topology.components(faces)[0]
     if made < asked:
-        reason = "no way that was tried came nearer to the count"
+        reason = "no method that was tried came nearer to the count"
     elif asked < min_of_a_piece * pieces:
         reason = f"it has {pieces} separate pieces, and each takes at least {min_of_a_piece} faces or so"
     elif asked < _FACES_OF_A_HANDLE * (handles := topology.handles(faces, pieces)):
@@ -117,9 +121,10 @@ def count_reason(
 
 @dataclass
 class RemeshPatch:
-    """Triangles to remesh: the whole surface or some of its pieces. What is derived from them is computed once.
+    """Triangles to remesh: the whole surface or some of its pieces.
 
-    mesh: the triangles, in a unit box. `quads` is the wanted count and `edge` the wanted edge length.
+    mesh: the triangles, in a unit box. `quads` is the wanted count and `edge` the wanted edge length. Properties are
+    computed once.
     """
 
     mesh: TriMesh
@@ -134,7 +139,7 @@ class RemeshPatch:
     def subset(
         self, chosen: np.ndarray, quads: int, skip_engines: bool = False, tolerance: float = COUNT_TOLERANCE
     ) -> RemeshPatch:
-        """Return a patch of some of the triangles. chosen (f,) bool."""
+        """Make a patch of some of the triangles, chosen (f,) bool."""
         return RemeshPatch(
             topology.compact(TriMesh(self.mesh.vertices, self.mesh.faces[chosen])),
             quads,
@@ -146,39 +151,39 @@ class RemeshPatch:
         )
 
     def has_count(self, count: int, wanted: float) -> bool:
-        """Whether a count is within the tolerance of the wanted one."""
+        """Return whether a count is within the tolerance of the wanted one."""
         return abs(count / wanted - 1) <= self.tolerance
 
     @cached_property
     def pieces(self) -> tuple[int, np.ndarray]:
-        """Number of connected pieces, and (f,) the piece of each triangle."""
+        """Return the number of connected pieces, and (f,) the piece of each triangle."""
         return topology.components(self.mesh.faces)
 
     @property
     def has_only_tiny_pieces(self) -> bool:
-        """Whether its pieces get fewer quads on average than a piece needs."""
+        """Return whether the pieces get fewer quads on average than a piece needs."""
         return self.quads < QUADS_OF_A_PIECE * self.pieces[0]
 
     @cached_property
     def handles(self) -> int:
-        """Number of handles (the sum of the genus of all pieces)."""
+        """Return the number of handles (the sum of the genus of all pieces)."""
         return topology.handles(self.mesh.faces, self.pieces[0])
 
     @cached_property
     def piece_areas(self) -> np.ndarray:
-        """(pieces,) area of each piece."""
+        """Return the area (pieces,) of each piece."""
         return np.bincount(self.pieces[1], face_normals(self.mesh)[1], self.pieces[0])
 
     @cached_property
     def surface(self) -> ProjectionTarget:
-        """The triangles with their search tree."""
+        """Return the triangles with their search tree."""
         return ProjectionTarget(self.mesh)
 
     @cached_property
     def has_narrow_strips(self) -> bool:
-        """Whether more than a few creases lie in pairs closer than _NARROW_EDGES, as on thin plates and small bevels.
+        """Return whether many creases lie in pairs closer than _NARROW_EDGES, as on thin plates and small bevels.
 
-        Always False for a mesh with more triangles than quads.
+        Many: more than _MAX_NARROW_SHARE of their length. Always False for a mesh with more triangles than quads.
         """
         return (
             len(self.mesh.faces) < self.quads
@@ -187,9 +192,10 @@ class RemeshPatch:
 
     @cached_property
     def has_thin_walls(self) -> bool:
-        """Whether more than a little of the surface bounds walls thinner than _WALL_EDGES, found by rays cast inward.
+        """Return whether more than _MAX_WALL_SHARE of the surface bounds walls thinner than _WALL_EDGES.
 
-        Always False for a mesh with fewer triangles than quads, for which a coarser mesh may work all the same.
+        Walls are found by rays cast inward. Always False for a mesh with fewer triangles than quads, for which a
+        coarser mesh may work all the same.
         """
         if len(self.mesh.faces) < self.quads:
             return False
@@ -202,5 +208,5 @@ class RemeshPatch:
 
     @cached_property
     def features(self) -> Features:
-        """Creases and boundaries of the triangles."""
+        """Find the creases and boundaries of the triangles."""
         return find_features(self.mesh, self.request.crease_degrees or 181.0, _MIN_FEATURE_EDGES * self.edge)

@@ -103,19 +103,19 @@ def _reconstruct(folder: Folder, options: Options, out: Output) -> None:
         aligned = pipeline.align(views, options.resolution, clock, out)
     grow = pipeline.growth(views, out)
     shape = pipeline.fuse(views, aligned, grow, picture, clock, out)
-    pipeline.check_cameras(folder.file("cameras.json"), views.cameras, shape.vertices)
-    mesh = pipeline.Surface(shape.vertices, shape.faces)
+    pipeline.check_cameras(folder.file("cameras.json"), views.cameras, shape.mesh.vertices)
+    surface = pipeline.Surface(shape.mesh)
     if options.method == "paper":
-        mesh = pipeline.fit_paper(views, aligned, shape, _paper_options(options, out), out)
-    normals, look = pipeline.find_materials(views, mesh, shape.step, read.light, options.seed, out)
+        surface = pipeline.fit_paper(views, aligned, shape, _paper_options(options, out), out)
+    normals, look = pipeline.find_materials(views, surface, shape.step, read.light, options.seed, out)
     figures = {
         **pipeline.figures_of(aligned, shape, grow),
         "mean_confidence": float(look.confidence.mean()),
         **look.figures,
-        **mesh.figures,
+        **surface.figures,
     }
     with out.step("write"):
-        _write(folder, mesh, normals, look, options.method, figures, out)
+        _write(folder, surface, normals, look, options.method, figures, out)
 
 
 def _paper_options(options: Options, out: Output) -> PaperOptions:
@@ -137,7 +137,7 @@ def _paper_options(options: Options, out: Output) -> PaperOptions:
 
 def _write(
     folder: Folder,
-    mesh: pipeline.Surface,
+    reconstructed: pipeline.Surface,
     normals: np.ndarray,
     look: Appearance,
     method: str,
@@ -149,8 +149,8 @@ def _write(
     from gdtool.folders.surface import Surface, write_surface
 
     surface = Surface(
-        mesh.vertices,
-        mesh.faces,
+        reconstructed.mesh.vertices,
+        reconstructed.mesh.faces,
         look.albedo,
         look.roughness,
         look.metallic,
@@ -163,9 +163,9 @@ def _write(
     write_surface(
         out,
         surface,
-        watertight=is_closed_manifold(mesh.faces),
+        watertight=is_closed_manifold(reconstructed.mesh.faces),
         method=method,
-        field=mesh.fit is not None,
+        field=reconstructed.fit is not None,
         source_from_world=folder.content.source_from_world,
         report=figures,
     )

@@ -35,10 +35,11 @@ _MAX_ANISOTROPY = 100  # ratio of singular values that one triangle counts as at
 
 @dataclass(frozen=True)
 class Request:
-    """What the caller asks for.
+    """The caller's request.
 
-    size: texels of the texture's side; padding: texels between charts at that size; max_stretch: a chart with more L2
-    stretch is cut; good_stretch: flattening stops there; max_cost: xatlas' limit on a chart; seconds: time limit.
+    size: texels of the texture's side; padding: texels between charts at that size; max_stretch: L2 stretch beyond
+    which a chart is cut; good_stretch: L2 stretch at which flattening stops; max_cost: xatlas' limit on a chart's cost;
+    seconds: time limit.
     """
 
     size: int = 2048
@@ -50,7 +51,7 @@ class Request:
 
 
 class _Deadlines(NamedTuple):
-    """When each step has to end, on the clock time.monotonic."""
+    """The time at which each step has to end, on the clock time.monotonic."""
 
     charts_found: float
     shaped: float  # from here on charts are only projected
@@ -63,7 +64,7 @@ _DEADLINE_SHARES = _Deadlines(0.2, 0.6, 0.7, 0.8, 0.9)  # of the time limit
 
 
 class Skipped(NamedTuple):
-    """Work that was not done: what, why, and the seconds it would have taken."""
+    """Work that was not done, the reason, and the seconds it would have taken."""
 
     what: str
     why: str
@@ -88,9 +89,9 @@ class UnwrapResult:
 def unwrap(mesh: QuadMesh, request: Request) -> UnwrapResult:
     """Make texture coordinates for a mesh with finite vertices; a quad lies in one chart.
 
-    Charts are never mirrored and do not overlap; all have one texel density. As the time runs
-    out, simpler ways take over: charts by the side of a box that faces look at, flattened by projection, at last each
-    face as a chart, packed in rows.
+    Charts are never mirrored and do not overlap; all have one texel density. As the time runs out, simpler methods are
+    used: charts by the side of a box that faces look at, flattened by projection; then each face as a chart; packing in
+    rows.
     """
     vertices, faces = mesh.vertices, mesh.faces
     started = time.monotonic()
@@ -109,7 +110,8 @@ def unwrap(mesh: QuadMesh, request: Request) -> UnwrapResult:
     charts, failed = _flatten_in_child(unit, segmentation, request, deadlines)
     failed = segmentation.failed + failed
     gap = request.padding / request.size
-    orders, skipped = [], []
+    orders: list[PlacementOrder] = []
+    skipped: list[Skipped] = []
     if time.monotonic() < deadlines.packed:
         charts, orders, skipped = _cut_for_packing(adjacency(), charts, gap, deadlines.packed)
     placed, _ = pack([(chart.uv, chart.triangles) for chart in charts], gap, orders, deadlines.packed)
@@ -128,7 +130,7 @@ def unwrap(mesh: QuadMesh, request: Request) -> UnwrapResult:
 def _flatten_in_child(
     mesh: QuadMesh, segmentation: Segmentation, request: Request, deadlines: _Deadlines
 ) -> tuple[list[Chart], list[str]]:
-    """Flatten the charts in a child process; where it fails, project charts by the side of a box they look at."""
+    """Flatten the charts in a child process; where that fails, flatten them here by projection alone."""
     limits = FlattenLimits(request.good_stretch, request.max_stretch, deadlines.shaped, deadlines.projected)
     try:
         child = begin(
@@ -146,7 +148,7 @@ def _flatten_in_child(
     except ChildFailed as failure:
         until = time.monotonic() + deadlines.projected - deadlines.shaped
         charts, reasons = flatten_all(mesh, segmentation.label, replace(limits, single_after=until))
-        return charts, [f"flattening: {failure}; charts by the side they look at", *reasons]
+        return charts, [f"flattening: {failure}; charts are made by the side of a box that faces look at", *reasons]
 
 
 def _cut_for_packing(
@@ -154,7 +156,7 @@ def _cut_for_packing(
 ) -> tuple[list[Chart], list[PlacementOrder], list[Skipped]]:
     """Cut the charts further where that fills the square better.
 
-    Returns the charts, orders to pack them in that were found on the way, and what was skipped.
+    gap: between charts, in uv. Returns the charts, the orders found in which to pack them, and what was skipped.
     """
     counts = [len(charts) + more for more in _MORE_CHARTS if len(charts) + more <= _MAX_CHARTS_TO_CUT]
     tried, start = [charts], time.monotonic()
@@ -172,14 +174,14 @@ def _cut_for_packing(
     if best.skipped:
         skipped.append(
             Skipped(
-                f"packing {best.skipped} ways to cut",
-                "the charts before filled too little of the square",
+                f"packing {best.skipped} sets of charts that are cut further",
+                "the sets before them filled too little of the square",
                 best.skipped * took / (len(tried) - best.skipped),
             )
         )
     if best.share > WELL_PACKED and len(tried) <= len(counts):
         skipped.append(Skipped("cutting further for packing", f"the charts fill {best.share:.0%} of the square", took))
-    return tried[best.index], best.orders, skipped
+    return tried[best.number], best.orders, skipped
 
 
 def figures(mesh: QuadMesh, size: int = 1024) -> dict[str, float | int]:
@@ -218,14 +220,17 @@ def figures(mesh: QuadMesh, size: int = 1024) -> dict[str, float | int]:
 
 
 def corner_triangles(face_uvs: np.ndarray, face_idx: np.ndarray) -> np.ndarray:
-    """Return texture corners (t, 3) of the triangles that triangulated() cuts the faces into."""
+    """Cut texture corners (f, 4) into those (t, 3) of the triangles that triangulated() makes of the faces.
+
+    face_idx (t,): the face of each triangle.
+    """
     second = np.zeros(len(face_idx), bool)
     second[1:] = face_idx[1:] == face_idx[:-1]
     return np.take_along_axis(face_uvs[face_idx], np.where(second[:, None], [0, 2, 3], [0, 1, 2]), 1).astype(np.int64)
 
 
 def uv_islands(mesh: QuadMesh) -> tuple[np.ndarray, float]:
-    """Return (f,) the chart of each face, and the length of all seams.
+    """Find the chart (f,) of each face, and the length of all seams.
 
     Faces are in one chart where their shared edge has the same texture corners on both sides.
     """
@@ -267,7 +272,7 @@ def invalid_reason(mesh: QuadMesh) -> str | None:
 
 
 def texels_per_unit(mesh: QuadMesh, size: int) -> float:
-    """Return the texel density: how many texels of a texture of `size` a unit of the surface has."""
+    """Compute the texel density: texels, of a texture of `size`, per unit of the surface."""
     uv, face_uvs = mesh.texture_coordinates()
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], 1)
     area = polygon_normals(mesh)[1].sum()
@@ -275,5 +280,5 @@ def texels_per_unit(mesh: QuadMesh, size: int) -> float:
 
 
 def padding_for_mips(size: int, smallest_mip: int) -> int:
-    """Return the texels between charts at `size` that leave one texel at the mip level of size `smallest_mip`."""
+    """Compute the texels between charts at `size` that leave one texel at the mip level of size `smallest_mip`."""
     return max(-(-size // min(smallest_mip, size)), 1)

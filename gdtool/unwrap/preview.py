@@ -13,13 +13,13 @@ _CHECKS = 32  # squares of the checkerboard along the side of the texture
 
 
 def _colors(count: int) -> np.ndarray:
-    """Return (count, 3) distinct light colours: hues a golden ratio apart."""
+    """Make (count, 3) distinct light colours: hues a golden ratio apart."""
     hue = (np.arange(count) * 0.618034) % 1
     return 0.62 + 0.3 * np.cos(2 * np.pi * (hue[:, None] + np.array([0, 1 / 3, 2 / 3])))
 
 
 def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.ndarray, size: int = 1024) -> np.ndarray:
-    """Render the charts (size, size, 3) in [0, 1]: one colour a chart, faces told apart by shade, white elsewhere."""
+    """Render the charts (size, size, 3) in [0, 1]: a colour for each chart, a shade for each face, white elsewhere."""
     _, face_idx = triangulated(faces)
     owner, _ = rasterize_uv(uv, corner_triangles(face_uvs, face_idx), size)
     face = np.where(owner >= 0, face_idx[owner], -1)
@@ -36,7 +36,7 @@ def layout(faces: np.ndarray, uv: np.ndarray, face_uvs: np.ndarray, chart: np.nd
 
 
 def checkerboard(mesh: QuadMesh, chart: np.ndarray, size: int = 512) -> np.ndarray:
-    """Render the mesh (size, 2 size, 3) in [0, 1] under a checkerboard: front right and back left.
+    """Render the mesh (size, 2 size, 3) in [0, 1] under a checkerboard, seen from front right and from back left.
 
     mesh: with texture coordinates. chart (f,): the chart of each face, which tints it.
     """

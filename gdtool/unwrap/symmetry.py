@@ -1,4 +1,4 @@
-"""Let both halves of a symmetric mesh share texels: one half is unwrapped, the other takes the corners of its twins."""
+"""Let both halves of a symmetric mesh share texels: one half is unwrapped, and the other copies its coordinates."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ _TOLERANCE = 1e-4  # of the longest side: how near to a vertex the mirror image 
 def mirror_twins(mesh: QuadMesh, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Match each face of the lower half with its mirror image in the upper half.
 
-    The plane is across `axis`, through the middle of
-    the bounding box. Returns twin (f,): the face of the upper half that mirrors a face of the lower half, -1 for all
-    others (upper faces, faces across the middle, faces without a twin); and corner (f, 4): which corner of its twin
-    each corner is, -1 where there is none.
+    The plane is across `axis`, through the middle of the bounding box. Returns twin (f,): the face of the upper half
+    that mirrors a face of the lower half. It is -1 for all others: upper faces, faces across the middle, faces without
+    a twin. Also returns corner (f, 4): the corner of the twin that mirrors each corner, -1 where there is none.
     """
     vertices, faces = mesh.vertices, mesh.faces
     from scipy.spatial import cKDTree
@@ -42,13 +41,13 @@ def mirror_twins(mesh: QuadMesh, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def copy_twin_corners(face_uvs: np.ndarray, kept: np.ndarray, twin: np.ndarray, corner: np.ndarray) -> np.ndarray:
-    """Return texture corners (f, 4) of all faces: those of kept faces, and for each other face its twin's.
+    """Copy texture corners from faces to their twins; return those (f, 4) of all faces.
 
-    face_uvs (k, 4) of the kept faces (k,).
+    face_uvs (k, 4) of the kept faces (k,); each other face gets its twin's.
     """
     out = np.full(corner.shape, -1, face_uvs.dtype)
     out[kept] = face_uvs
     other = np.flatnonzero(twin >= 0)
-    taken = np.take_along_axis(out[twin[other]], np.maximum(corner[other], 0), 1)
-    out[other] = np.where(corner[other] >= 0, taken, -1)
+    twin_corners = np.take_along_axis(out[twin[other]], np.maximum(corner[other], 0), 1)
+    out[other] = np.where(corner[other] >= 0, twin_corners, -1)
     return out

@@ -6,8 +6,10 @@ import numpy as np
 
 
 def torus(around: int, across: int, major: float = 0.35, minor: float = 0.14):
-    """Quads (f, 4) of a torus about +Y, vertices (v, 3), outward normals (v, 3); seen from outside
-    counter-clockwise."""
+    """Make a torus about +Y: vertices (v, 3), quads (f, 4), outward unit normals (v, 3).
+
+    Quads are counter-clockwise seen from outside.
+    """
     a, b = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(across) * 2 * np.pi / across, indexing="ij")
     normals = np.stack([np.cos(b) * np.sin(a), np.sin(b), np.cos(b) * np.cos(a)], -1).reshape(-1, 3)
     centre = major * np.stack([np.sin(a), 0 * a, np.cos(a)], -1).reshape(-1, 3)
@@ -19,7 +21,7 @@ def torus(around: int, across: int, major: float = 0.35, minor: float = 0.14):
 
 
 def sphere(rings: int, radius: float = 0.5):
-    """Triangles of a sphere: vertices (v, 3), faces (f, 3), an octahedron subdivided `rings` times."""
+    """Make a sphere, an octahedron subdivided `rings` times: vertices (v, 3), triangles (f, 3)."""
     vertices = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     for _ in range(rings):
@@ -34,12 +36,12 @@ def sphere(rings: int, radius: float = 0.5):
 
 
 def triangles_of(quads: np.ndarray) -> np.ndarray:
-    """Each quad (f, 4) cut along corners 0 and 2: (2 f, 3)."""
+    """Cut each quad (f, 4) along corners 0 and 2: (2 f, 3)."""
     return np.stack([quads[:, :3], quads[:, [0, 2, 3]]], 1).reshape(-1, 3)
 
 
 def unwrapped(vertices: np.ndarray, faces: np.ndarray, size: int = 512, padding: int = 4):
-    """xatlas charts of triangles: uv (c, 2), (0, 0) at the image's top left, and face_uvs (t, 3)."""
+    """Unwrap triangles with xatlas: uv (c, 2), (0, 0) at the image's top left, and face_uvs (t, 3)."""
     import xatlas
 
     atlas = xatlas.Atlas()
@@ -53,7 +55,7 @@ def unwrapped(vertices: np.ndarray, faces: np.ndarray, size: int = 512, padding:
 
 
 def albedo_of(points: np.ndarray) -> np.ndarray:
-    """A smooth, colourful function of position: (n, 3) linear in [0.05, 0.95]."""
+    """Compute a smooth, colourful function (n, 3) of position, linear, in [0.05, 0.95]."""
     x, y, z = points.T
     return np.stack(
         [0.5 + 0.4 * np.sin(9 * x + 2 * y), 0.5 + 0.4 * np.sin(8 * z - 3 * x), 0.45 + 0.35 * np.cos(11 * y + 4 * z)], -1
@@ -61,5 +63,5 @@ def albedo_of(points: np.ndarray) -> np.ndarray:
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Decibels, peak 1."""
+    """Compute the peak signal-to-noise ratio in decibels, for a peak of 1."""
     return float(-10 * np.log10(np.mean((np.asarray(a, float) - b) ** 2) + 1e-20))

@@ -1,4 +1,4 @@
-"""The maps as they are stored, eight bits and gutters, against an analytic material: their error, and their seams."""
+"""Stored maps, eight bits with gutters, against an analytic material: their error, and their seams."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,7 @@ import pytest
 from benchmarks.bake.score import Seams
 from gdtool.bake.maps import make_maps
 from gdtool.bake.pipeline import BakeOptions, bake, vertex_lookup
-from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets
 from gdtool.bake.target import Target, points_at, texels_of
 from gdtool.geometry.meshes import TriMesh
 from gdtool.images.color import srgb_from_linear
@@ -18,6 +18,7 @@ SIZE = 1024
 
 
 def on_torus(points, major=0.35, minor=0.14):
+    """Find the nearest points (n, 3) on the analytic torus."""
     ring = points * (1, 0, 1)
     ring = major * ring / np.linalg.norm(ring, axis=1, keepdims=True)
     away = points - ring
@@ -25,13 +26,14 @@ def on_torus(points, major=0.35, minor=0.14):
 
 
 def material(points):
+    """Compute the stored values of the analytic material at the torus points nearest to points (n, 3)."""
     at = on_torus(points)
     return {"albedo": srgb_from_linear(albedo_of(at)), "roughness": 0.5 + 0.8 * at[:, 0]}
 
 
 @pytest.fixture(scope="module")
 def stored():
-    """A dense torus baked onto a coarse one: its target, its texels and the maps' bytes as numbers of 0…1."""
+    """Bake a dense torus onto a coarse one: the target, its texels, and the stored maps in [0, 1]."""
     fine, fine_quads, fine_normals = torus(640, 360)
     coarse, quads, _ = torus(60, 30, minor=0.141)
     faces = triangles_of(quads)
@@ -44,14 +46,14 @@ def stored():
         texels,
         source,
         vertex_lookup(source, attributes, fine_normals),
-        vertex_reach(TriMesh(coarse, faces), source),
+        cage_offsets(TriMesh(coarse, faces), source),
         BakeOptions(threads=2),
     )
     maps = make_maps(texels, baked.values)
     return target, texels, {"albedo": maps.base_color / 255, "roughness": maps.orm[..., 1:2] / 255}
 
 
-def test_stored_maps_are_the_material_to_55_db(stored):
+def test_stored_maps_match_the_material_to_55_db(stored):
     target, texels, maps = stored
     true = material(points_at(target, texels.face_idx, texels.barycentric)[0][: texels.inside])
     for name, image in maps.items():
@@ -69,7 +71,7 @@ def test_no_seam_shows(stored):
     seams = Seams(SimpleNamespace(target=target, material=material), SIZE)
     for name, image in maps.items():
         assert seams.ratio(name, image) <= 1.2
-        bare = np.zeros_like(image)
+        without_gutters = np.zeros_like(image)
         inside = texels.texel[: texels.inside]
-        bare.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
-        assert seams.ratio(name, bare) > 1.2
+        without_gutters.reshape(-1, image.shape[2])[inside] = image.reshape(-1, image.shape[2])[inside]
+        assert seams.ratio(name, without_gutters) > 1.2

@@ -1,4 +1,4 @@
-"""What becomes a map, what a factor, and what is left out."""
+"""What is stored as a map, what as a factor, and what is left out."""
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from gdtool.geometry.uv_raster import rasterize_uv
 
 @pytest.fixture
 def texels():
+    """Rasterise a square chart into a map of 64 x 64."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.2, 0.8], [0.8, 0.8], [0.8, 0.2], [0.2, 0.2]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
@@ -19,6 +20,7 @@ def texels():
 
 
 def values(texels, albedo=(0.5, 0.2, 0.1), roughness=0.4, metallic=0.0, normal=(0.0, 0.0, 1.0)):
+    """Make values of texels, constant over all of them."""
     n = len(texels)
     fill = lambda v: np.ascontiguousarray(np.broadcast_to(np.asarray(v, np.float32), (n, *np.shape(v))))  # noqa: E731
     return {
@@ -46,25 +48,25 @@ def test_constants_become_factors(texels):
     assert contact_sheet_of(maps).dtype == np.uint8
 
 
-def test_orm_packs_as_gltf_says_and_a_constant_channel_stays_a_factor(texels):
-    given = values(texels)
-    given["roughness"] = np.linspace(0.2, 0.8, len(texels), dtype=np.float32)
+def test_orm_is_packed_as_in_gltf_and_a_constant_channel_is_a_factor(texels):
+    inputs = values(texels)
+    inputs["roughness"] = np.linspace(0.2, 0.8, len(texels), dtype=np.float32)
     occlusion = np.full(len(texels), 0.5, np.float32)
-    maps = make_maps(texels, given, occlusion)
+    maps = make_maps(texels, inputs, occlusion)
     assert maps.factors["roughness"] == (1.0,)
     assert maps.factors["metallic"] == (0.0,)
     inside = maps.orm.reshape(-1, 3)[texels.texel]
     np.testing.assert_array_equal(inside[:, 0], 128)
-    np.testing.assert_allclose(inside[:, 1] / 255, given["roughness"], atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(inside[:, 1] / 255, inputs["roughness"], atol=0.5 / 255 + 1e-6)
     np.testing.assert_array_equal(inside[:, 2], 255)  # times the factor 0
     assert maps.has_occlusion
     assert maps.has_roughness_metallic
 
 
 def test_base_color_is_srgb_and_gutters_hold_no_black(texels):
-    given = values(texels)
-    given["albedo"][: len(texels) // 2] = (0.2158605, 0.9, 0.9)
-    maps = make_maps(texels, given)
+    inputs = values(texels)
+    inputs["albedo"][: len(texels) // 2] = (0.2158605, 0.9, 0.9)
+    maps = make_maps(texels, inputs)
     stored = maps.base_color.reshape(-1, 3)
     assert stored[texels.texel[0], 0] == 128  # IEC 61966-2-1
     assert maps.base_color.min() > 80
@@ -72,33 +74,33 @@ def test_base_color_is_srgb_and_gutters_hold_no_black(texels):
 
 
 def test_alpha_is_kept_and_opaque_alpha_dropped(texels):
-    given = values(texels)
-    given["alpha"] = np.ones(len(texels), np.float32)
-    assert make_maps(texels, given).base_color is None
-    given["alpha"] = np.where(np.arange(len(texels)) % 2, 1, 0.25).astype(np.float32)
-    maps = make_maps(texels, given)
+    inputs = values(texels)
+    inputs["alpha"] = np.ones(len(texels), np.float32)
+    assert make_maps(texels, inputs).base_color is None
+    inputs["alpha"] = np.where(np.arange(len(texels)) % 2, 1, 0.25).astype(np.float32)
+    maps = make_maps(texels, inputs)
     assert maps.base_color.shape[2] == 4
     assert set(np.unique(maps.base_color.reshape(-1, 4)[texels.texel][:, 3])) == {64, 255}
 
 
 @pytest.mark.parametrize("least", [0.5 / 255, 0.5])
 def test_color_that_is_never_seen_darkens_no_neighbour(texels, least):
-    """Leaves are cut out of black: under no alpha, or under less than the cutoff, the color around is stored."""
-    given, hidden = values(texels), np.arange(len(texels)) % 5 < 2
-    given["albedo"][:] = (0.2, 0.5, 0.3)
-    given["albedo"][hidden] = 0
-    given["alpha"] = np.where(hidden, 0.9 * least, 1).astype(np.float32)
-    stored = make_maps(texels, given, options=MapOptions(least_alpha=least)).base_color
+    """Leaves cut out of black: texels with alpha below the limit are stored in the color of their surroundings."""
+    inputs, hidden = values(texels), np.arange(len(texels)) % 5 < 2
+    inputs["albedo"][:] = (0.2, 0.5, 0.3)
+    inputs["albedo"][hidden] = 0
+    inputs["alpha"] = np.where(hidden, 0.9 * least, 1).astype(np.float32)
+    stored = make_maps(texels, inputs, options=MapOptions(least_alpha=least)).base_color
     at = stored.reshape(-1, 4)[texels.texel]
     np.testing.assert_array_equal(at[:, :3], np.tile(at[~hidden][0, :3], (len(at), 1)))
     assert stored[..., :3].min() > 100
-    np.testing.assert_array_equal(at[:, 3], np.rint(given["alpha"] * 255))
-    given["alpha"][hidden] = 1.1 * least + 0.01  # is seen: stays as it is
-    at = make_maps(texels, given, options=MapOptions(least_alpha=least)).base_color.reshape(-1, 4)[texels.texel]
+    np.testing.assert_array_equal(at[:, 3], np.rint(inputs["alpha"] * 255))
+    inputs["alpha"][hidden] = 1.1 * least + 0.01  # visible, so the color stays
+    at = make_maps(texels, inputs, options=MapOptions(least_alpha=least)).base_color.reshape(-1, 4)[texels.texel]
     assert at[hidden][:, :3].max() == 0
 
 
-def test_normal_map_only_where_it_says_something(texels):
+def test_a_normal_map_is_stored_only_where_it_is_not_flat(texels):
     tilt = lambda degrees: (np.sin(np.radians(degrees)), 0.0, np.cos(np.radians(degrees)))  # noqa: E731
     assert make_maps(texels, values(texels, normal=tilt(0.8))).normal is None
     assert make_maps(texels, values(texels, normal=tilt(0.8)), options=MapOptions(normal_map="on")).normal is not None
@@ -110,7 +112,7 @@ def test_normal_map_only_where_it_says_something(texels):
     assert flat_angle(np.tile(tilt(3), (9, 1))) == pytest.approx(3)
 
 
-def test_directx_turns_green_only():
+def test_directx_inverts_green_only():
     image = np.array([[[10, 20, 30]]], np.uint8)
     np.testing.assert_array_equal(directx(image), [[[10, 235, 30]]])
     np.testing.assert_array_equal(directx(directx(image)), image)

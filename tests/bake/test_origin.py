@@ -1,4 +1,4 @@
-"""What a bake reads from: views before the field before the vertices."""
+"""The sources of a bake: views come before the field, and the field before the vertices."""
 
 import numpy as np
 import pytest
@@ -38,15 +38,15 @@ def places_on(surface, count=4000):
 
 
 def at(origin, places):
-    return origin.source.at(places.face_idx, places.barycentric, origin.source.vertices)
+    return origin.source.at(places.face_idx, places.barycentric, origin.source.mesh.vertices)
 
 
-def test_views_give_what_they_see_and_vertices_the_rest(surface):
+def test_views_give_what_they_see_and_vertices_everything_else(surface):
     origin = from_surface(surface, torus_views(192))
     places = places_on(surface)
     read = origin.lookup(places)
     points = at(origin, places)
-    # Six views at eye level see the outside of the ring; its inner side and its very top they do not.
+    # Six views at eye level see the outside of the ring, but neither its inner side nor its top.
     outside = (np.linalg.norm(points[:, [0, 2]], axis=1) > 0.42) & (read["seen"] > 0.95)
     assert outside.mean() > 0.3
     assert psnr(read["albedo"][outside], albedo_of(points[outside])) > 32
@@ -88,7 +88,7 @@ def test_a_part_in_front_does_not_colour_what_it_hides(surface):
     np.testing.assert_allclose(origin.lookup(on_plate)["albedo"], [[1, 0, 0]], atol=1e-3)
 
 
-def test_one_view_that_disagrees_with_the_others_is_left_out(surface):
+def test_a_view_that_disagrees_with_the_others_is_left_out(surface):
     views = torus_views(192)
     albedo = views.images["albedo"].copy()
     albedo[1] = (0.0, 1.0, 0.0)  # front right, between front and right
@@ -106,12 +106,12 @@ def test_one_view_that_disagrees_with_the_others_is_left_out(surface):
     points = at(origin, places)
     read = origin.lookup(places)["albedo"]
     toward = (surface.normals[surface.faces[places.face_idx, 0]] * (np.sqrt(0.5), 0, np.sqrt(0.5))).sum(1) > 0.9
-    # Front and right see what front right faces, at 45 degrees, and the vertices agree with them.
+    # The front and right views see the same surface at 45 degrees, and the vertices agree with them.
     error = np.abs(read[toward] - albedo_of(points[toward])).max(1)
     assert (error < 0.1).mean() > 0.8
 
 
-def test_the_field_serves_where_views_show_no_material(surface, tmp_path):
+def test_the_field_replaces_materials_that_views_lack(surface, tmp_path):
     import torch
     from safetensors.torch import save_file
 

@@ -19,7 +19,7 @@ def test_constant_stays_constant_everywhere(shape):
     np.testing.assert_allclose(push_pull(image, mask), np.broadcast_to([0.2, 0.5, 0.9], (*shape, 3)), atol=1e-6)
 
 
-def test_known_texels_stay_and_filled_ones_lie_within_their_range():
+def test_known_texels_stay_and_filled_texels_lie_within_their_range():
     mask = disc()
     rng = np.random.default_rng(0)
     image = np.where(mask[..., None], rng.uniform(0.3, 0.6, (65, 65, 3)), -100.0)
@@ -58,6 +58,6 @@ def test_mip_levels_near_a_chart_keep_its_colour():
     np.testing.assert_allclose(filled, np.broadcast_to([0.8, 0.2, 0.1], filled.shape), atol=1e-6)
 
 
-def test_nothing_known_gives_the_image_back():
+def test_an_empty_mask_returns_the_image():
     image = np.random.default_rng(0).uniform(size=(8, 8))
     np.testing.assert_array_equal(push_pull(image, np.zeros((8, 8), bool)), image)

@@ -1,4 +1,4 @@
-"""What a picture adds to a view of itself: paint, and not light."""
+"""The detail that a picture adds to the view of the same object: paint, but not light."""
 
 from dataclasses import replace
 
@@ -18,8 +18,11 @@ from tests.stages.bake_folders import torus_views
 FINE, COARSE = 256, 64
 
 
-def shown(painted: np.ndarray, light: np.ndarray):
-    """A view's albedo (COARSE) and the picture (FINE, RGBA) of a disc so painted and lit."""
+def view_and_picture(painted: np.ndarray, light: np.ndarray):
+    """Make the albedo of a view (COARSE) and the picture (FINE, RGBA) of a disc that is painted and lit.
+
+    Also returns the disc's mask (FINE, FINE).
+    """
     y, x = np.mgrid[:FINE, :FINE] + 0.5
     disc = (((x - FINE / 2) ** 2 + (y - FINE / 2) ** 2) < (0.4 * FINE) ** 2).astype(float)[..., None]
     view = resized(np.concatenate([painted * disc, disc], -1), COARSE, COARSE)
@@ -35,10 +38,10 @@ def camera():
     return replace(rig("six", COARSE)[0])
 
 
-def test_paint_comes_back_under_smooth_light(camera):
+def test_paint_is_recovered_under_smooth_light(camera):
     y, x = np.mgrid[:FINE, :FINE]
     painted = np.stack([0.2 + 0.6 * ((x // 9 + y // 9) % 2), 0.3 + 0.3 * ((x // 5) % 2), 0.5 + 0 * x], -1)
-    albedo, picture, disc = shown(painted, 0.4 + 0.5 * x / FINE)
+    albedo, picture, disc = view_and_picture(painted, 0.4 + 0.5 * x / FINE)
     coarse = resized(albedo, FINE, FINE)
     sharp = coarse * picture_of(picture, camera, albedo).factor
     inside = resized(resized(disc * 1.0, COARSE, COARSE), FINE, FINE) > 0.99
@@ -48,27 +51,29 @@ def test_paint_comes_back_under_smooth_light(camera):
 def test_hard_shadows_on_one_color_are_no_paint(camera):
     y, x = np.mgrid[:FINE, :FINE]
     light = np.where((x + y) % 40 < 12, 0.3, 0.9)
-    albedo, picture, _ = shown(np.full((FINE, FINE, 3), 0.5), light)
+    albedo, picture, _ = view_and_picture(np.full((FINE, FINE, 3), 0.5), light)
     np.testing.assert_allclose(picture_of(picture, camera, albedo).factor, 1, atol=1e-3)
 
 
 def test_a_picture_no_finer_than_its_view_adds_nothing(camera):
-    albedo, picture, _ = shown(np.random.default_rng(0).uniform(0.2, 0.8, (FINE, FINE, 3)), np.ones((FINE, FINE)))
+    albedo, picture, _ = view_and_picture(
+        np.random.default_rng(0).uniform(0.2, 0.8, (FINE, FINE, 3)), np.ones((FINE, FINE))
+    )
     small = resized(picture, COARSE, COARSE)
     np.testing.assert_allclose(picture_of(small, camera, albedo).factor, 1, atol=1e-5)
 
 
-def test_points_meet_the_pixels_that_show_them(camera):
+def test_points_read_the_pixels_that_show_them(camera):
     rng = np.random.default_rng(1)
     points = rng.uniform(-0.3, 0.3, (50, 3))
     ramp = np.stack(np.broadcast_arrays(*np.meshgrid(np.arange(FINE) + 0.5, np.arange(FINE) + 0.5), 1.0), -1)
-    albedo, picture, _ = shown(np.full((FINE, FINE, 3), 0.5), np.ones((FINE, FINE)))
-    found = replace(picture_of(picture, camera, albedo), factor=ramp.astype(np.float32)).at(points)
-    np.testing.assert_allclose(found[:, :2], project(camera, points)[0] * FINE / COARSE, atol=1e-3)
+    albedo, picture, _ = view_and_picture(np.full((FINE, FINE, 3), 0.5), np.ones((FINE, FINE)))
+    factors = replace(picture_of(picture, camera, albedo), factor=ramp.astype(np.float32)).at(points)
+    np.testing.assert_allclose(factors[:, :2], project(camera, points)[0] * FINE / COARSE, atol=1e-3)
 
 
-def test_the_view_that_the_others_were_made_of_is_not_outvoted():
-    """All views but the front show another color: what the front sees is the picture's all the same."""
+def test_the_view_that_the_others_were_generated_from_is_not_outvoted():
+    """All views but the front show another color; where the front sees the surface, its color is baked."""
     vertices, quads, normals = torus(160, 90)
     count, views = len(vertices), torus_views(96)
     other = np.full((count, 3), 0.5)
@@ -77,19 +82,22 @@ def test_the_view_that_the_others_were_made_of_is_not_outvoted():
     )
     albedo = np.where(views.mask[..., None] > 0, np.full(3, 0.5), 0).astype(np.float32)
     albedo[0] = views.images["albedo"][0]
-    given = Views(views.cameras, {"albedo": albedo}, views.mask)
+    changed_views = Views(views.cameras, {"albedo": albedo}, views.mask)
     picture = picture_of(np.concatenate([albedo[0], views.mask[0, ..., None]], -1), views.cameras[0], albedo[0])
     places = _front_places(vertices, triangles_of(quads), normals)
-    fading, known = (from_surface(surface, given, picture=one) for one in (None, picture))
-    points = known.source.at(places.face_idx, places.barycentric, known.source.vertices)
-    errors = [np.abs(one.lookup(places)["albedo"] - albedo_of(points)).mean() for one in (fading, known)]
+    without_picture, with_picture = (from_surface(surface, changed_views, picture=one) for one in (None, picture))
+    points = with_picture.source.at(places.face_idx, places.barycentric, with_picture.source.mesh.vertices)
+    errors = [
+        np.abs(one.lookup(places)["albedo"] - albedo_of(points)).mean() for one in (without_picture, with_picture)
+    ]
     assert errors[1] < 0.05
     assert errors[1] < 0.5 * errors[0]
-    assert "picture: albedo" in known.label
-    assert "picture" not in fading.label
+    assert "picture: albedo" in with_picture.label
+    assert "picture" not in without_picture.label
 
 
 def _front_places(vertices, faces, normals):
+    """Choose places in the middle of faces that the front camera sees well."""
     from gdtool.bake.reproject import Places
 
     facing = np.flatnonzero(normals[faces].mean(1)[:, 2] > 0.95)
@@ -102,8 +110,8 @@ def _front_places(vertices, faces, normals):
     )
 
 
-def test_a_picture_tells_color_where_other_views_face_the_surface_better_and_nothing_else():
-    """A plane at 40 degrees to the front camera and 5 to the next; only colors follow the picture's view."""
+def test_only_colors_follow_the_pictures_view_where_others_face_the_surface_better():
+    """A plane at 40 degrees to the front camera and at 5 to the next: only its colors follow the front view."""
     from gdtool.bake.project_views import ViewStack, observe, view_visibility
     from gdtool.geometry.rays import RayCaster
 

@@ -6,7 +6,7 @@ import pytest
 from gdtool.bake.maps import make_maps
 from gdtool.bake.occlusion import ambient_visibility, bake_occlusion
 from gdtool.bake.pipeline import BakeOptions, bake, occlusion_tracer, vertex_lookup
-from gdtool.bake.reproject import Source, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets
 from gdtool.bake.target import Target, corner_normals, points_at, texels_of
 from gdtool.geometry.meshes import TriMesh
 from gdtool.geometry.tangents import decode_tangent_space
@@ -37,7 +37,7 @@ def torus_bake():
     source = Source(TriMesh(fine, triangles_of(fine_quads)))
     attributes = {"albedo": albedo_of(fine), "roughness": 0.5 + 0.3 * fine[:, 0], "metallic": np.full(len(fine), 0.25)}
     lookup = vertex_lookup(source, attributes, fine_normals)
-    reach = vertex_reach(TriMesh(coarse, faces), source)
+    reach = cage_offsets(TriMesh(coarse, faces), source)
     return target, texels, source, lookup, reach, bake(target, texels, source, lookup, reach, BakeOptions(threads=2))
 
 
@@ -67,12 +67,12 @@ def test_normal_map_decodes_to_the_fine_normals(torus_bake):
     assert (baked.values["tangent_normal"][:, 2] > 0.7).all()
 
 
-def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake):
+def test_supersampling_is_nearer_the_texel_mean_and_only_where_values_vary(torus_bake):
     target, texels, source, _, reach, _ = torus_bake
 
-    # Above the middle stripes finer than a texel, whose mean is one half; below it one half everywhere.
+    # The upper half has stripes finer than a texel, whose mean is one half; the lower half is one half everywhere.
     def stripes(places):
-        y = source.at(places.face_idx, places.barycentric, source.vertices)[:, 1:2]
+        y = source.at(places.face_idx, places.barycentric, source.mesh.vertices)[:, 1:2]
         count = len(places.face_idx)
         return {
             "albedo": np.repeat(np.where(y > 0, (np.sin(900 * y) > 0) * 1.0, 0.5), 3, 1),
@@ -81,14 +81,14 @@ def test_supersampling_only_where_it_varies_and_nearer_the_texel_mean(torus_bake
             "normal": source.face_normals[places.face_idx],
         }
 
-    one = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
+    single = bake(target, texels, source, stripes, reach).values["albedo"][: texels.inside]
     many = bake(target, texels, source, stripes, reach, BakeOptions(samples=16))
-    assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(one - 0.5).mean()
+    assert np.abs(many.values["albedo"][: texels.inside] - 0.5).mean() < 0.7 * np.abs(single - 0.5).mean()
     assert 0.4 < many.report["supersampled_share"] < 0.9
 
 
 def test_thin_wall_does_not_bleed_through():
-    # A plate 0.4 % thick, red above and blue below; the mesh that is baked lies off it by twice its thickness.
+    # A plate 0.4 % thick, red above and blue below; the baked mesh is off by twice its thickness.
     vertices = np.array([[-0.5, 0, -0.5], [0.5, 0, -0.5], [0.5, 0, 0.5], [-0.5, 0, 0.5]])
     top, bottom = vertices + (0, 0.002, 0), vertices - (0, 0.002, 0)
     up, down = np.array([[0, 2, 1], [0, 3, 2]]), np.array([[4, 5, 6], [4, 6, 7]])
@@ -107,13 +107,13 @@ def test_thin_wall_does_not_bleed_through():
         faces = np.concatenate([up, down])
         target = Target.of(TriMesh(low, faces), uv, faces)
         texels = texels_of(target, 64)
-        baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(low, faces), source))
+        baked = bake(target, texels, source, lookup, cage_offsets(TriMesh(low, faces), source))
         expected = np.where((texels.face_idx < 2)[:, None], [1.0, 0, 0], [0, 0, 1.0])
         np.testing.assert_allclose(baked.values["albedo"], expected, atol=1e-6)
 
 
 def test_a_chart_smaller_than_a_texel_has_its_own_color():
-    """A blue triangle that covers no texel's centre, beside the chart of a red square: its lookups are blue."""
+    """A blue triangle whose chart covers no texel's centre, beside the chart of a red square: its lookups are blue."""
     vertices = np.array(
         [
             [-0.5, 0, -0.5],
@@ -135,14 +135,14 @@ def test_a_chart_smaller_than_a_texel_has_its_own_color():
         source, {"albedo": albedo, "roughness": np.ones(7), "metallic": np.zeros(7)}, np.repeat([[0, 1.0, 0]], 7, 0)
     )
     texels = texels_of(target, 64)
-    baked = bake(target, texels, source, lookup, vertex_reach(TriMesh(vertices, faces), source))
+    baked = bake(target, texels, source, lookup, cage_offsets(TriMesh(vertices, faces), source))
     image = make_maps(texels, baked.values).base_color
     assert rasterize_uv(uv, faces, 64)[0].max() == 1
     np.testing.assert_array_equal(image[19:23, 39:43], np.broadcast_to([0, 0, 255], (4, 4, 3)))
     np.testing.assert_array_equal(image[7:31, 7:31], np.broadcast_to([255, 0, 0], (24, 24, 3)))
 
 
-def test_every_covered_texel_is_read_and_ring_texels_continue_it(torus_bake):
+def test_every_covered_texel_is_read_and_ring_texels_continue_the_chart(torus_bake):
     target, texels, _, _, _, baked = torus_bake
     owner, _ = rasterize_uv(target.uv, target.face_uvs, 256)
     np.testing.assert_array_equal(texels.mask(inside_only=True), owner >= 0)

@@ -1,14 +1,14 @@
-"""Points of a baked mesh find their place on the source, on the right side of walls."""
+"""Points of a baked mesh find their places on the source, on the right side of walls."""
 
 import numpy as np
 
-from gdtool.bake.reproject import Source, reproject, vertex_reach
+from gdtool.bake.reproject import Source, cage_offsets, reproject
 from gdtool.geometry.meshes import TriMesh
 from tests.bake.shapes import sphere, torus, triangles_of
 
 
 def box(size):
-    """A closed box centred at the origin: vertices (8, 3), faces (12, 3)."""
+    """Make a closed box centred at the origin: vertices (8, 3), faces (12, 3)."""
     x, y, z = np.array(size) / 2
     vertices = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (-z, z)])
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -16,7 +16,8 @@ def box(size):
 
 
 def at(source, places):
-    return source.at(places.face_idx, places.barycentric, source.vertices)
+    """Compute the positions (n, 3) of places on a source."""
+    return source.at(places.face_idx, places.barycentric, source.mesh.vertices)
 
 
 def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
@@ -32,7 +33,7 @@ def test_sphere_inside_and_outside_points_meet_it_along_the_normal():
 
 
 def test_thin_wall_is_never_crossed():
-    # A plate 0.1 % thick; the baked mesh strays by several times that, to either side.
+    # A plate 0.1 % thick; the baked mesh is off by several times that, to either side.
     vertices, faces = box((1.0, 1.0, 0.001))
     source = Source(TriMesh(vertices, faces))
     rng = np.random.default_rng(1)
@@ -47,10 +48,10 @@ def test_thin_wall_is_never_crossed():
             np.testing.assert_allclose(at(source, places)[:, :2], xy, atol=3e-7)  # weights of the corners are float32
 
 
-def test_nearest_point_serves_where_the_normal_misses_and_stays_on_its_side():
+def test_the_nearest_point_on_its_side_is_taken_where_the_normal_misses():
     vertices, faces = box((1.0, 1.0, 0.001))
     source = Source(TriMesh(vertices, faces))
-    # Beside the plate: the normal meets nothing, the other side's rim is as near.
+    # Beside the plate: rays along the normal meet nothing, and both sides' rims are equally near.
     points = np.array([[0.6, 0.1, 0.0005], [0.6, 0.1, -0.0005], [0.6, 0.1, -0.0006]])
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1]])
     places = reproject(points, normals, np.full(3, 0.01), source)
@@ -64,13 +65,13 @@ def test_reach_covers_the_distance_but_not_the_object():
     vertices, quads, _ = torus(300, 150)
     coarse, coarse_quads, _ = torus(40, 20, minor=0.145)
     faces = triangles_of(coarse_quads)
-    reach = vertex_reach(TriMesh(coarse, faces), Source(TriMesh(vertices, triangles_of(quads))))
+    reach = cage_offsets(TriMesh(coarse, faces), Source(TriMesh(vertices, triangles_of(quads))))
     assert reach.min() > 0.005
     assert reach.max() < 0.08
 
 
-def test_a_sheet_without_another_side_is_read_from_behind():
-    # A square at z = 0 that looks along +z, and a floor far below its middle that looks the way its back does not.
+def test_a_one_sided_sheet_is_read_from_behind():
+    # A one-sided square at z = 0 that faces +z, and one far below it that faces -z.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     source = Source(
@@ -82,14 +83,13 @@ def test_a_sheet_without_another_side_is_read_from_behind():
         places = reproject(points, np.tile([0.0, 0.0, side], (500, 1)), np.full(500, 0.01), source)
         np.testing.assert_allclose(at(source, places), points * (1, 1, 0), atol=1e-6)
         assert (places.from_behind == (side < 0)).all()
-    # Within reach what looks the same way comes first, however near the sheet.
+    # A face within reach that faces the same way is taken first, however near the sheet is.
     places = reproject(points, np.tile([0.0, 0.0, -1.0], (500, 1)), np.full(500, 0.35), source)
     np.testing.assert_allclose(at(source, places)[:, 2], -0.3, atol=1e-6)
 
 
-def test_a_sheet_is_not_looked_through():
-    # What lies behind a sheet without another side, and looks the same way as the mesh, is not what the mesh stands
-    # for.
+def test_nothing_is_read_through_a_one_sided_sheet():
+    # Behind a one-sided sheet lies a face that faces the same way as the baked mesh; it must not be read.
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     faces = np.array([[0, 2, 1], [0, 3, 2]])
     source = Source(
@@ -104,7 +104,7 @@ def test_a_sheet_is_not_looked_through():
         assert places.by_ray.all()
 
 
-def test_of_two_faces_back_to_back_the_one_that_looks_the_same_way_is_read():
+def test_of_two_faces_back_to_back_the_agreeing_one_is_read():
     square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
     front = np.array([[0, 1, 2], [0, 2, 3]])
     rng = np.random.default_rng(4)

@@ -52,7 +52,7 @@ def test_the_reason_for_a_missed_count_follows_from_the_topology():
         count_reason(cube()[1], 40, 16, ["simplify: it died"])
         == "fewer would change its shape, or its topology (simplify: it died)"
     )
-    assert count_reason(cube()[1], 12, 16, []) == "no way that was tried came nearer to the count"
+    assert count_reason(cube()[1], 12, 16, []) == "no method that was tried came nearer to the count"
 
 
 @pytest.mark.parametrize(

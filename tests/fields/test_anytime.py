@@ -79,8 +79,8 @@ def test_no_time_at_all_gives_one_round_and_the_draft(ring, bent):
     shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=noise, outvoted=0), clock=clock)
     assert coarser
     assert shape.step == fusion.DRAFT_COARSENESS * step
-    assert is_closed_manifold(shape.faces)
-    assert np.abs(torus(shape.vertices)).mean() < 0.01
+    assert is_closed_manifold(shape.mesh.faces)
+    assert np.abs(torus(shape.mesh.vertices)).mean() < 0.01
 
 
 def test_the_finest_grid_that_there_is_time_for(ring):
@@ -98,5 +98,5 @@ def test_the_finest_grid_that_there_is_time_for(ring):
     shape, coarser = fuse_within_budget(prepared, step, options=FusionOptions(noise=0.0, outvoted=0), clock=Clock())
     whole = fuse_views(prepared, step)
     assert coarser == ""
-    assert (shape.vertices == whole.vertices).all()
-    assert (shape.faces == whole.faces).all()
+    assert (shape.mesh.vertices == whole.mesh.vertices).all()
+    assert (shape.mesh.faces == whole.mesh.faces).all()

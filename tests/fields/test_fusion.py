@@ -61,21 +61,19 @@ def reconstruct(cameras, images, mask, depth=True, normal=True):
 @pytest.mark.parametrize("solid, volume", [(sphere, np.pi / 6), (cube, 1.0), (torus, 2 * np.pi**2 * 0.35 * 0.15**2)])
 def test_all_domains_meet_the_analytic_surface(seen, solid, volume):
     shape = reconstruct(*seen[solid.__name__])
-    error = np.abs(solid(shape.vertices))
-    assert is_closed_manifold(shape.faces)
+    error = np.abs(solid(shape.mesh.vertices))
+    assert is_closed_manifold(shape.mesh.faces)
     assert error.mean() < 0.002
     assert error.max() < 0.04
-    assert signed_volume(TriMesh(shape.vertices, shape.faces)) == pytest.approx(
-        volume, rel=0.02
-    )  # positive: wound outward
+    assert signed_volume(shape.mesh) == pytest.approx(volume, rel=0.02)  # positive: wound outward
 
 
 @pytest.mark.parametrize("depth, normal, bound", [(True, False, 0.003), (False, True, 0.006), (False, False, 0.02)])
 def test_subsets_of_the_domains(seen, depth, normal, bound):
     shape = reconstruct(*seen["torus"], depth=depth, normal=normal)
-    assert is_closed_manifold(shape.faces)
-    assert np.abs(torus(shape.vertices)).mean() < bound
-    euler = len(shape.vertices) - len(shape.faces) // 2
+    assert is_closed_manifold(shape.mesh.faces)
+    assert np.abs(torus(shape.mesh.vertices)).mean() < bound
+    euler = len(shape.mesh.vertices) - len(shape.mesh.faces) // 2
     assert euler == 0  # one hole, as seen from the front
 
 
@@ -94,9 +92,9 @@ def test_edges_are_drawn_out(monkeypatch):
 
     def missed():
         shape = fuse_views(prepared, step)
-        assert is_closed_manifold(shape.faces)
-        assert len(fold_midpoints(TriMesh(shape.vertices, shape.faces))) == 0
-        return np.array([closest_points(edge, TriMesh(shape.vertices, shape.faces))[0].mean() for edge in edges])
+        assert is_closed_manifold(shape.mesh.faces)
+        assert len(fold_midpoints(shape.mesh)) == 0
+        return np.array([closest_points(edge, shape.mesh)[0].mean() for edge in edges])
 
     sharp = missed()
     monkeypatch.setattr("gdtool.fields.grid.fusion.sharpen_creases", lambda mesh, *_: mesh)
@@ -121,9 +119,9 @@ def test_a_narrow_gap_stays_open():
     shape = reconstruct(*views_of(opener, SIZE))
     along, up = np.meshgrid(np.linspace(-0.1, 0.38, 25), np.linspace(-0.08, 0.08, 9))
     between, within = (np.stack([along, up, np.full_like(along, z)], -1).reshape(-1, 3) for z in (0.0, 0.1))
-    assert is_closed_manifold(shape.faces)
-    assert inside(between, TriMesh(shape.vertices, shape.faces)).mean() < 0.1
-    assert inside(within, TriMesh(shape.vertices, shape.faces)).all()
+    assert is_closed_manifold(shape.mesh.faces)
+    assert inside(between, shape.mesh).mean() < 0.1
+    assert inside(within, shape.mesh).all()
 
 
 def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
@@ -142,8 +140,8 @@ def test_what_leaves_a_silhouette_goes_back_as_far_as_it_must():
 
 def test_two_pieces_stay_two(seen):
     shape = reconstruct(*seen["two_balls"])
-    assert components(shape.faces, len(shape.vertices)).max() == 1
-    assert np.abs(two_balls(shape.vertices)).mean() < 0.002
+    assert components(shape.mesh.faces, len(shape.mesh.vertices)).max() == 1
+    assert np.abs(two_balls(shape.mesh.vertices)).mean() < 0.002
 
 
 def test_silhouette_distance_is_subpixel():
@@ -220,18 +218,23 @@ def test_bumps_that_the_normals_do_not_show_go(seen, solid):
     )
     assert rough.bumps is None
     assert smooth.bumps > BUMPY_DEGREES
-    assert is_closed_manifold(smooth.faces)
-    before, after = degrees_off(solid, rough.vertices, rough.faces), degrees_off(solid, smooth.vertices, smooth.faces)
+    assert is_closed_manifold(smooth.mesh.faces)
+    before, after = (
+        degrees_off(solid, rough.mesh.vertices, rough.mesh.faces),
+        degrees_off(solid, smooth.mesh.vertices, smooth.mesh.faces),
+    )
     assert np.median(after) < 0.6 * np.median(before)
-    assert np.abs(solid(smooth.vertices)).mean() < np.abs(solid(rough.vertices)).mean() + 1e-4
+    assert np.abs(solid(smooth.mesh.vertices)).mean() < np.abs(solid(rough.mesh.vertices)).mean() + 1e-4
 
 
 @pytest.mark.parametrize("solid", [sphere, torus])
 def test_a_surface_grows_by_as_much_as_it_is_asked_to(seen, solid):
     prepared, step, noise = bumpy(seen, solid.__name__)
     plain, grown = (fuse_views(prepared, step, FusionOptions(noise=noise, grow=grow)) for grow in (0.0, step / 2))
-    assert np.mean(solid(grown.vertices)) - np.mean(solid(plain.vertices)) == pytest.approx(step / 2, rel=0.15)
-    assert is_closed_manifold(grown.faces)
+    assert np.mean(solid(grown.mesh.vertices)) - np.mean(solid(plain.mesh.vertices)) == pytest.approx(
+        step / 2, rel=0.15
+    )
+    assert is_closed_manifold(grown.mesh.faces)
 
 
 @pytest.mark.parametrize("solid", [sphere, cube, torus])
@@ -241,10 +244,10 @@ def test_a_surface_that_fits_its_normals_hardly_follows_them(seen, solid):
     step = grid_step(cameras, 0)
     shape = reconstruct(cameras, images, mask)
     prepared = prepare_all(cameras, mask, images["depth"], images["normal"])
-    assert normal_deviation_degrees(TriMesh(shape.vertices, shape.faces), prepared, 2 * step) < BUMPY_DEGREES
+    assert normal_deviation_degrees(shape.mesh, prepared, 2 * step) < BUMPY_DEGREES
     moved = (
         np.linalg.norm(
-            fit_to_normals(TriMesh(shape.vertices, shape.faces), prepared, step, reach=2 * step) - shape.vertices,
+            fit_to_normals(shape.mesh, prepared, step, reach=2 * step) - shape.mesh.vertices,
             axis=1,
         )
         / step
@@ -273,9 +276,9 @@ def test_a_thin_wall_that_two_views_turn_inside_out_has_no_hole():
     step = grid_step(cameras, 0)
     prepared, _, noise = align_depth(cameras, mask, depth, images["normal"], step)
     shape = fuse_views(prepared, step, FusionOptions(noise=noise))
-    assert is_closed_manifold(shape.faces)
-    assert components(shape.faces, len(shape.vertices)).max() == 0
-    assert euler_number(shape.faces) == 2
+    assert is_closed_manifold(shape.mesh.faces)
+    assert components(shape.mesh.faces, len(shape.mesh.vertices)).max() == 0
+    assert euler_number(shape.mesh.faces) == 2
 
 
 def test_what_a_grown_silhouette_gains_is_free_as_far_as_beside_it(seen):
@@ -355,9 +358,9 @@ def test_views_that_contradict_one_another_still_close(seen):
     kinds = ["sphere", "torus", "two_balls", "cube", "torus", "two_balls"]
     images = {n: np.stack([seen[kind][1][n][k] for k, kind in enumerate(kinds)]) for n in ("depth", "normal")}
     shape = reconstruct(cameras, images, np.stack([seen[kind][2][k] for k, kind in enumerate(kinds)]))
-    assert is_closed_manifold(shape.faces)
-    assert np.isfinite(shape.vertices).all()
-    assert signed_volume(TriMesh(shape.vertices, shape.faces)) > 0.01
+    assert is_closed_manifold(shape.mesh.faces)
+    assert np.isfinite(shape.mesh.vertices).all()
+    assert signed_volume(shape.mesh) > 0.01
 
 
 def test_flat_card_and_empty_views_close():
@@ -369,12 +372,12 @@ def test_flat_card_and_empty_views_close():
     cameras, images, mask = views_of(card, 48)
     mask[4] = 0
     shape = reconstruct(cameras, images, mask)
-    assert is_closed_manifold(shape.faces)
-    assert np.ptp(shape.vertices[:, 0]) > 0.95
-    assert np.ptp(shape.vertices[:, 1]) > 0.75
+    assert is_closed_manifold(shape.mesh.faces)
+    assert np.ptp(shape.mesh.vertices[:, 0]) > 0.95
+    assert np.ptp(shape.mesh.vertices[:, 1]) > 0.75
     # As thin as the grid can hold, and without a hole.
-    assert np.abs(shape.vertices[:, 2]).max() < 1.2 * shape.step
-    assert len(shape.vertices) - len(shape.faces) // 2 == 2
+    assert np.abs(shape.mesh.vertices[:, 2]).max() < 1.2 * shape.step
+    assert len(shape.mesh.vertices) - len(shape.mesh.faces) // 2 == 2
 
 
 def test_true_views_confirm_one_another_and_noise_does_not(seen):

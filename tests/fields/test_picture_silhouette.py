@@ -7,7 +7,6 @@ from gdtool.fields.grid.fusion import FusionOptions, fuse_views, grid_step, is_c
 from gdtool.fields.grid.picture_silhouette import missing_pixels, opposite, restore_picture_silhouette
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import grid_over
-from gdtool.geometry.meshes import TriMesh
 
 from .shapes import views_of
 
@@ -49,23 +48,25 @@ def test_a_wing_that_the_other_views_look_through_is_there(seen):
         fuse_views(seen, step, FusionOptions(noise=0.5 * step, picture_view=known)) for known in ("", "front")
     )
     assert without.restored == 0
-    assert np.abs(without.vertices[:, 0]).max() < 0.3
-    wing = found.vertices[np.abs(found.vertices[:, 0]) > 0.2]
-    assert is_closed_manifold(found.faces)
+    assert np.abs(without.mesh.vertices[:, 0]).max() < 0.3
+    wing = found.mesh.vertices[np.abs(found.mesh.vertices[:, 0]) > 0.2]
+    assert is_closed_manifold(found.mesh.faces)
     assert 0.2 < found.restored < 0.8
     assert np.abs(wing[:, 0]).max() == pytest.approx(0.4, abs=0.02)
     assert np.abs(wing[:, 1]).max() == pytest.approx(HIGH, abs=0.015)  # a pixel
     assert np.abs(wing[:, 2]).max() == pytest.approx(CHORD, abs=0.02)
     # The body is as it was.
-    tail = without.vertices[np.abs(without.vertices[:, 2]) > 0.25]
-    assert closest_points(tail, TriMesh(found.vertices, found.faces))[0].max() < 0.5 * step
+    tail = without.mesh.vertices[np.abs(without.mesh.vertices[:, 2]) > 0.25]
+    assert closest_points(tail, found.mesh)[0].max() < 0.5 * step
 
 
 def test_views_that_agree_are_left_alone(seen):
     step = grid_step([prepared_view.camera for prepared_view in seen], 0)
-    one, two = (fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front"))
-    assert two.restored == 0
-    assert np.array_equal(one.vertices, two.vertices)
+    plain, with_picture = (
+        fuse_views(seen, step, FusionOptions(noise=0.0, picture_view=known)) for known in ("", "front")
+    )
+    assert with_picture.restored == 0
+    assert np.array_equal(plain.mesh.vertices, with_picture.mesh.vertices)
 
 
 def test_without_a_view_from_behind_a_part_is_as_thick_as_wide(seen):

@@ -10,13 +10,13 @@ from gdtool.remesh.engines import candidate as candidates
 from gdtool.remesh.engines import search
 
 
-def whole(faces) -> bool:
-    """All quads, watertight and manifold."""
+def is_watertight_manifold(faces) -> bool:
+    """Return whether all faces are quads, watertight and manifold."""
     return faces.min() >= 0 and topology.is_watertight(faces) and topology.is_manifold(faces)
 
 
 class Ended:
-    """A child that has ended, in the place of one that works."""
+    """A child process that has ended with a result or a failure."""
 
     def __init__(self, outcome):
         self.outcome = outcome
@@ -31,14 +31,16 @@ class Ended:
 
 
 def in_this_process(monkeypatch, engine=None) -> list:
-    """Candidates are made here, by `engine` in the place of every engine where one is given; the calls, as they
-    come."""
+    """Make candidates in this process instead of in children; return the list of calls, filled as they come.
+
+    engine: replaces every engine, unless it is None.
+    """
     calls = []
 
-    def begin(_, *given, **limits):
-        calls.append(given)
+    def begin(_, *arguments, **limits):
+        calls.append(arguments)
         try:
-            return Ended(candidates.make_candidate(*given))
+            return Ended(candidates.make_candidate(*arguments))
         except ChildFailed as failure:
             return Ended(failure)
 
@@ -49,12 +51,12 @@ def in_this_process(monkeypatch, engine=None) -> list:
 
 
 def around(faces, middle) -> tuple[np.ndarray, np.ndarray]:
-    """The faces that touch face `middle` at one corner only, and those that share an edge with it."""
+    """Find the faces that touch face `middle` at one corner only, and those that share an edge with it."""
     shared = np.isin(faces, faces[middle]).sum(1)
     return np.flatnonzero(shared == 1), np.flatnonzero(shared == 2)
 
 
 def inner_face(vertices, faces) -> int:
-    """A face in the middle of a side of a cube."""
+    """Find a face in the middle of a cube's side."""
     centre = vertices[faces].mean(1)
     return int(np.linalg.norm(centre - [0.07, 0.07, centre[:, 2].max()], axis=1).argmin())

@@ -1,4 +1,4 @@
-"""Folded quads are taken out, and nothing else changes."""
+"""Folded quads are collapsed, and nothing else changes."""
 
 from __future__ import annotations
 
@@ -17,25 +17,28 @@ from tests.geometry.solids import quad_torus
 
 
 def opened(vertices: np.ndarray, faces: np.ndarray, at: int, apart: float) -> tuple[np.ndarray, np.ndarray, list[int]]:
-    """A vertex of four quads doubled, with a quad between the two that is folded by so much of an edge; that quad."""
+    """Split vertex `at` of four quads into two, with a new quad between them that is folded by `apart` edge lengths.
+
+    Returns the vertices, the faces and the new quad's corners.
+    """
     ring = [faces[(faces == at).any(1)][0].tolist()]
     while len(ring) < 4:
         before = ring[-1][(ring[-1].index(at) - 1) % 4]
         ring.append(next(f for f in faces.tolist() if at in f and f[(f.index(at) + 1) % 4] == before))
-    one, two = (quad[(quad.index(at) + 1) % 4] for quad in (ring[0], ring[2]))
+    first_end, second_end = (quad[(quad.index(at) + 1) % 4] for quad in (ring[0], ring[2]))
     out = faces.copy()
     for quad in ring[:2]:
-        own = (faces == quad).all(1)
-        out[own] = np.where(faces[own] == at, len(vertices), faces[own])
+        is_quad = (faces == quad).all(1)
+        out[is_quad] = np.where(faces[is_quad] == at, len(vertices), faces[is_quad])
     side = vertices[ring[1][(ring[1].index(at) + 1) % 4]] - vertices[at]
-    new = [at, two, len(vertices), one]
+    new = [at, second_end, len(vertices), first_end]
     if not topology.is_watertight(np.concatenate([out, [new]])):
         new = new[::-1]
     return np.concatenate([vertices, (vertices[at] - apart * side)[None]]), np.concatenate([out, [new]]), new
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.2])
-def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
+def test_a_folded_quad_is_collapsed_and_its_surroundings_stay(apart):
     vertices, faces = quad_torus()
     torn, quads, _ = opened(vertices, faces, 17, apart)
     assert topology.is_watertight(quads)
@@ -54,7 +57,7 @@ def test_a_folded_quad_goes_and_its_surroundings_stay(apart):
     assert len(np.unique(np.concatenate([out, vertices]).round(9), axis=0)) <= len(vertices) + 1
 
 
-def test_what_is_held_stays():
+def test_vertices_held_by_constraints_are_not_collapsed():
     vertices, faces = quad_torus()
     torn, quads, new = opened(vertices, faces, 17, 0.1)
     constraints = Constraints.none(len(torn))
@@ -67,7 +70,7 @@ def test_what_is_held_stays():
     out, quads_out = made.vertices, made.faces
     assert out is torn
     assert quads_out is quads
-    # One of the two is held: it is the one that stays, where it was.
+    # If one of the two corners is on a curve, that corner is kept where it is.
     constraints.curve[new[2]] = -1
     made, after = collapse_folded_quads(QuadMesh(torn, quads), target_of_quads(QuadMesh(vertices, faces)), constraints)
     out, quads_out = made.vertices, made.faces
@@ -76,7 +79,7 @@ def test_what_is_held_stays():
     assert (out[after.curve >= 0] == torn[new[0]]).all()
 
 
-def test_nothing_happens_without_folded_quads():
+def test_a_mesh_without_folded_quads_is_unchanged():
     vertices, faces = quad_torus()
     made, _ = collapse_folded_quads(
         QuadMesh(vertices, faces), target_of_quads(QuadMesh(vertices, faces)), Constraints.none(len(vertices))

@@ -1,5 +1,4 @@
-"""Pairs of irregular vertices that are led together: what was pulled apart closes, creases stay, the mesh stays
-whole."""
+"""Edge rotations cancel pairs of irregular vertices; creases stay, and the mesh stays a manifold."""
 
 import numpy as np
 import pytest
@@ -15,18 +14,23 @@ from tests.geometry.solids import marching, plane, quad_cube, quad_torus
 
 
 def rotated(quads: np.ndarray, p: int, q: int) -> np.ndarray:
-    """The edge from p to q turned within the hexagon around it: it ends now at the corner before p in its first
-    face."""
-    one = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
-    two = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
-    r, s = (one[(one.index(q) + i) % 4] for i in (1, 2))
-    t, u = (two[(two.index(p) + i) % 4] for i in (1, 2))
-    left = [f for f in quads.tolist() if f not in (one, two)]
-    return np.array([*left, [s, p, t, u], [u, q, r, s]])
+    """Rotate the edge from p to q within the hexagon of its two faces.
+
+    It then ends at the corner before p in the first face.
+    """
+    first = next(f for f in quads.tolist() if p in f and f[(f.index(p) + 1) % 4] == q)
+    second = next(f for f in quads.tolist() if q in f and f[(f.index(q) + 1) % 4] == p)
+    r, s = (first[(first.index(q) + i) % 4] for i in (1, 2))
+    t, u = (second[(second.index(p) + i) % 4] for i in (1, 2))
+    others = [f for f in quads.tolist() if f not in (first, second)]
+    return np.array([*others, [s, p, t, u], [u, q, r, s]])
 
 
 def sheared(quads: np.ndarray, columns: list[tuple[int, int]]) -> np.ndarray:
-    """The rungs of a row of quads turned one after the other: two pairs of irregular vertices, as far apart."""
+    """Rotate the edges between a row of quads one after the other.
+
+    This makes a pair of irregular vertices at each end of the row.
+    """
     for rung in columns:
         quads = rotated(quads, *rung)
     return quads
@@ -38,7 +42,7 @@ def irregular(points, quads) -> int:
 
 
 @pytest.mark.parametrize("apart", [1, 2, 5, 9])
-def test_what_was_pulled_apart_closes(apart):
+def test_separated_pairs_of_irregular_vertices_cancel(apart):
     n = 24
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 2 + apart)])
@@ -50,7 +54,7 @@ def test_what_was_pulled_apart_closes(apart):
     assert len(quads_out) == len(quads)
 
 
-def test_what_is_too_far_apart_is_put_back():
+def test_pairs_too_far_apart_are_put_back():
     n = 40
     points, quads = quad_torus(n)
     torn = sheared(quads, [(i * n + 3, i * n + 4) for i in range(2, 22)])
@@ -58,7 +62,7 @@ def test_what_is_too_far_apart_is_put_back():
     assert {frozenset(f) for f in quads_out.tolist()} == {frozenset(f) for f in torn.tolist()}
 
 
-def test_a_regular_mesh_and_an_open_one_stay():
+def test_regular_and_open_meshes_are_unchanged():
     for points, quads in (quad_torus(), quad_cube(3)):
         assert (np.sort(cancel_pairs(QuadMesh(points, quads)), 1) == np.sort(quads, 1)).all()
     n = 8
@@ -68,8 +72,8 @@ def test_a_regular_mesh_and_an_open_one_stay():
     assert (cancel_pairs(QuadMesh(points, quads)) == quads).all()
 
 
-def test_a_band_with_one_side_stays():
-    """A Moebius band has no two sides: edges that two faces walk the same way cannot be turned."""
+def test_a_moebius_band_is_unchanged():
+    """A Moebius band is not orientable: edges that two faces traverse in the same direction cannot be rotated."""
     n = 20
     at = np.arange(n * 5).reshape(n, 5)
     following = np.concatenate([at[1:], at[:1, ::-1]])
@@ -78,8 +82,8 @@ def test_a_band_with_one_side_stays():
     assert (cancel_pairs(QuadMesh(points, quads)) == quads).all()
 
 
-def test_creases_stay():
-    """Edges of a cube turn no more, whatever would cancel across them."""
+def test_edges_at_creases_are_not_rotated():
+    """A cube's edges are not rotated, whatever pairs would cancel across them."""
     points, quads = quad_cube(3)
     ends, _, degrees = dihedral_degrees(TriMesh(points, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
     crease = {tuple(sorted(edge)) for edge in ends[degrees > 45].tolist()}
@@ -88,20 +92,20 @@ def test_creases_stay():
     for edge in rng.permutation(flat)[:40].tolist():
         try:
             turned = rotated(torn, *edge)
-        except StopIteration:  # turned away before
+        except StopIteration:  # no longer an edge
             continue
         valence = valences(turned, len(points))[0]
         if valence.min() > 2 and topology.is_manifold(turned):
             torn = turned
     quads_out = cancel_pairs(QuadMesh(points, torn))
-    kept = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
-    assert crease <= kept
+    edges_out = {tuple(sorted(edge)) for edge in topology.edges_of(quads_out).ends.tolist()}
+    assert crease <= edges_out
     assert topology.is_watertight(quads_out)
     assert topology.is_manifold(quads_out)
     assert irregular(points, quads_out) < irregular(points, torn) / 2
 
 
-def test_an_engine_s_quads_have_fewer(monkeypatch):
+def test_rotations_leave_fewer_irregular_vertices_in_an_engines_quads(monkeypatch):
     vertices, faces = marching(lambda x, y, z: (np.hypot(x, y) - 0.6) ** 2 + z**2 - 0.06 - 0.02 * np.sin(7 * x), 48)
     attempt = EngineAttempt("instant-meshes", 1, (1.0,), 30.0)
     quads_out = make_candidate(TriMesh(vertices / 2, faces), attempt, 8000)

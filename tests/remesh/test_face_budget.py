@@ -1,4 +1,4 @@
-"""The coarsest mesh within a distance, by the count that remesh is given."""
+"""The coarsest mesh within a distance is found by the counts that are requested from remesh()."""
 
 import numpy as np
 import pytest
@@ -10,16 +10,16 @@ from gdtool.remesh.task import Record, Request
 
 @pytest.fixture
 def counted(monkeypatch):
-    """remesh that only remembers the counts it is asked for; its distance is 2 / count."""
-    asked = []
+    """Replace remesh() by one that records the requested counts; the distance of its quads is 2 / count."""
+    counts = []
 
     def remesh(mesh, request):
-        asked.append(request.quads)
+        counts.append(request.quads)
         return QuadMesh(mesh.vertices, np.zeros((request.quads, 4), np.int64)), Record()
 
     monkeypatch.setattr(face_budget, "remesh", remesh)
     monkeypatch.setattr(face_budget, "deviation", lambda mesh, made: 2 / (len(made.faces) / 2))
-    return asked
+    return counts
 
 
 def test_fewest_quads_within_a_distance_are_found_in_a_few_runs(counted):
@@ -32,7 +32,7 @@ def test_fewest_quads_within_a_distance_are_found_in_a_few_runs(counted):
     assert len(counted) <= 6
 
 
-def test_when_all_are_too_few_the_most_are_given(counted):
+def test_the_largest_count_is_returned_when_even_it_is_too_small(counted):
     made, _, reached = face_budget.coarsest_within(
         TriMesh(np.zeros((3, 3)), np.zeros((1, 3), int)), Request(quads=500), 0.002
     )

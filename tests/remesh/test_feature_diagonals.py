@@ -1,4 +1,4 @@
-"""Features across quads: their diagonal, the cut along it."""
+"""Features across quads: vertices held to diagonals, and quads cut along them."""
 
 import numpy as np
 
@@ -9,30 +9,30 @@ from gdtool.remesh.fit.surface_projection import ProjectionTarget, subdivide
 
 
 def grid(n: int = 4):
-    """A flat grid of n x n unit quads."""
+    """Make a flat grid of n x n unit quads."""
     y, x = np.mgrid[: n + 1, : n + 1]
     vertices = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1).astype(float)
     corner = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     return vertices, np.stack([corner, corner + 1, corner + n + 2, corner + n + 1], -1)
 
 
-def test_a_path_round_a_corner_crosses_its_quad():
+def test_a_path_around_a_corner_crosses_its_quad():
     vertices, faces = grid()
     walk = [5, 6, 11, 12]  # right, up, right: a staircase about the quads of corners 6 and 5
     path = np.stack([walk[:-1], walk[1:]], -1)
     curve = np.full(len(vertices), -1)
     curve[walk] = 3
     before = Constraints(curve, np.zeros(len(vertices), bool), path, np.full(3, 3))
-    # Of the two corners in the staircase one is let off here; the other stays.
+    # One of the staircase's two corners is released here.
     after = Constraints(np.where(np.arange(len(vertices)) == 6, -1, curve), before.fixed, path[2:], np.full(1, 3))
-    face_idx, found = quads_crossed_by_features(faces, before, after)
+    face_idx, crossing_curve = quads_crossed_by_features(faces, before, after)
     assert len(face_idx) == 1
     assert set(faces[face_idx[0]]) == {5, 6, 10, 11}
-    assert found.tolist() == [3]
+    assert crossing_curve.tolist() == [3]
     made, halved = subdivide(QuadMesh(vertices, faces), after)
     new_vertices = made.vertices
-    held = hold_centres(halved, len(new_vertices) - len(faces), face_idx, found)
-    added = np.flatnonzero(held.curve != halved.curve)
+    constraints = hold_centres(halved, len(new_vertices) - len(faces), face_idx, crossing_curve)
+    added = np.flatnonzero(constraints.curve != halved.curve)
     assert np.allclose(new_vertices[added], [[0.5, 1.5, 0]])
     released = release_straight_corners(QuadMesh(vertices, faces), before)
     assert (released.curve[[6, 11]] < 0).all()

@@ -1,4 +1,4 @@
-"""Irregular vertices that cancel: one quad closes, the mesh stays whole."""
+"""Irregular vertices cancel when a quad is collapsed; the mesh stays a manifold."""
 
 import numpy as np
 
@@ -10,11 +10,11 @@ from tests.geometry.solids import quad_torus
 
 
 def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertex v of four quads split in two of three edges, with a new quad between: the inverse of closing one."""
-    mine = np.flatnonzero((quads == v).any(1))
-    after = {int(q[(q.tolist().index(v) + 1) % 4]): i for i, q in zip(mine, quads[mine], strict=True)}
-    before = {i: int(q[(q.tolist().index(v) - 1) % 4]) for i, q in zip(mine, quads[mine], strict=True)}
-    fan = [int(mine[0])]
+    """Split vertex v of four quads into two of three edges, with a new quad between: a diagonal collapse inverted."""
+    around = np.flatnonzero((quads == v).any(1))
+    after = {int(q[(q.tolist().index(v) + 1) % 4]): i for i, q in zip(around, quads[around], strict=True)}
+    before = {i: int(q[(q.tolist().index(v) - 1) % 4]) for i, q in zip(around, quads[around], strict=True)}
+    fan = [int(around[0])]
     while len(fan) < 4:
         fan.append(after[before[fan[-1]]])
     quads = quads.copy()
@@ -25,7 +25,7 @@ def opened(points: np.ndarray, quads: np.ndarray, v: int) -> tuple[np.ndarray, n
     return np.concatenate([points, points[v : v + 1] * 1.01]), np.concatenate([quads, [[v, start, len(points), end]]])
 
 
-def test_an_opened_vertex_closes_again():
+def test_a_split_vertex_is_merged_again():
     points, quads = quad_torus()
     more_points, more = opened(points, quads, 40)
     assert topology.is_watertight(more)
@@ -38,7 +38,7 @@ def test_an_opened_vertex_closes_again():
     assert (valences(quads_out, len(out))[0] == 4).all()
 
 
-def test_a_regular_mesh_stays():
+def test_a_regular_mesh_is_unchanged():
     points, quads = quad_torus()
     made = cancel_irregular(QuadMesh(points, quads))
     out, quads_out = made.vertices, made.faces

@@ -1,4 +1,4 @@
-"""What an engine makes is mended, judged and not believed; whatever it does, a way through is found."""
+"""Engines' quads are repaired and judged; whatever an engine does, there is a result."""
 
 import time
 
@@ -20,7 +20,7 @@ from gdtool.remesh.fit.shaping import SnappedQuads, rejection_reason, target_of_
 from gdtool.remesh.fit.surface_projection import ProjectionTarget
 from gdtool.remesh.task import Record, RemeshPatch, Request
 from tests.geometry.solids import cube, marching, quad_cube, sphere, torus, volume
-from tests.remesh.engines import Ended, around, in_this_process, inner_face, whole
+from tests.remesh.engines import Ended, around, in_this_process, inner_face, is_watertight_manifold
 
 
 @pytest.mark.parametrize("failure", ["died of SIGSEGV", "ended with exit code 0 and no result"])
@@ -31,13 +31,13 @@ def test_dead_engine_is_replaced(monkeypatch, failure):
     quads_out = made.faces
     assert record.engine == "pair and split"
     assert any(failure in text for text in record.failed)
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 900 - 1) <= 0.03
 
 
 @pytest.mark.parametrize("outcome, runs", [("a smaller sphere", 1), ("a crash", 3)])
-def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypatch, outcome, runs):
-    """Another density or no creases mend a seam that tore; a part that is too fine for the quads stays so."""
+def test_an_engine_far_from_the_surface_runs_once_and_a_crashing_one_again(monkeypatch, outcome, runs):
+    """Another density, or no creases, may avoid a crash; quads too coarse for a part stay so."""
     vertices, faces = sphere(24)
     made, _ = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -48,7 +48,7 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
         return QuadMesh(out / 2, quads_out)
 
     calls = in_this_process(monkeypatch, engine)
-    # Drawn onto the large sphere the small one would become it.
+    # Without this, fitting would turn the small sphere into the large one.
     monkeypatch.setattr(
         candidates,
         "snap_to_features",
@@ -66,7 +66,7 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     quads_out = made.faces
     assert len(calls) == runs
     assert record.engine == "pair and split"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert outcome == "a crash" or "strays" in record.failed[0]
 
 
@@ -75,8 +75,8 @@ def test_an_engine_that_strays_is_asked_once_and_one_that_crashes_again(monkeypa
     [((0.3, 1.0), 1000, [1, 0]), ((0.3, 1.0), 1100, [0, 1]), ((0.39, 1.0), 1000, [0, 1]), ((0.3, 0.3), 875, [0, 1])],
     ids=["far", "of another count", "in no doubt", "both far"],
 )
-def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_is_in_doubt(tops, wanted, order):
-    """Balls without a cap, and whole ones."""
+def test_a_much_nearer_candidate_goes_before_a_doubtful_one(tops, wanted, order):
+    """Candidates are balls without a cap, and whole balls."""
     vertices, faces = sphere(24, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -88,20 +88,22 @@ def test_of_two_the_one_much_nearer_to_the_surface_comes_first_where_the_other_i
         )
         for height in tops
     ]
-    assert [id(one) for one in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
+    assert [id(candidate) for candidate in search.EngineSearch(patch, Record())._nearer_first(pair, wanted)] == [
         id(pair[k]) for k in order
     ]
 
 
-def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(monkeypatch):
-    """Half a ball, a tenth too few quads; a whole one lacks nothing, nor one without a cap that its tip can be drawn
-    over."""
+def test_quads_that_leave_out_surface_are_rejected_before_fitting(monkeypatch):
+    """Half a ball is rejected, and no other count is requested.
+
+    A whole ball passes, and so does one whose missing cap can be covered by tip extrusion.
+    """
     vertices, faces = sphere(24, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
     patch = RemeshPatch(TriMesh(vertices, faces), 1000, 0.045, Request(), None)
     height = out[quads_out].mean(1)[:, 2]
-    left = [
+    reasons = [
         Candidate(
             search.EngineAttempt("instant-meshes", 0, (1.0,), 30.0),
             1000,
@@ -110,8 +112,8 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
         ).missing_surface(patch)
         for most in (1.0, 0.37, 0.0)
     ]
-    assert left[:2] == [None, None]
-    assert "leaves out 3" in left[2]
+    assert reasons[:2] == [None, None]
+    assert "leaves out 3" in reasons[2]
     calls = in_this_process(monkeypatch, lambda *_: topology.compact(QuadMesh(out, quads_out[height < 0.0])))
     monkeypatch.setattr(candidates, "repair_and_judge", lambda mesh, *_: candidates.JudgedQuads(None, mesh))
     monkeypatch.setattr(search.EngineSearch, "_fit_first_good", None)
@@ -122,7 +124,7 @@ def test_what_leaves_out_a_part_is_not_drawn_and_not_asked_for_another_count(mon
 
 
 @pytest.mark.parametrize("thickness, thin", [(0.03, True), (0.05, False)])
-def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
+def test_subdivision_is_given_up_where_walls_are_thinner_than_quads(thickness, thin):
     vertices, faces = igl.upsample(*cube(), 5)
     vertices = vertices * (0.9, 0.9, thickness)
     patch = RemeshPatch(TriMesh(vertices, faces), 4000, (2 * 0.81 / 4000) ** 0.5, Request(), None)
@@ -130,7 +132,7 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
     wedge = vertices.copy()
     wedge[:, 2] *= 0.01 + (wedge[:, 0] + 0.45) / 0.9 * 0.7 / thickness
     assert not RemeshPatch(TriMesh(wedge, faces), 4000, 0.02, Request(), None).has_thin_walls
-    # One side of a sheet is no wall, nor is what lies outside, before it.
+    # A one-sided sheet is no wall, on neither of its sides.
     assert not RemeshPatch(
         TriMesh(vertices, faces[face_normals(TriMesh(vertices, faces))[0][:, 2] > 0.5]),
         2000,
@@ -138,21 +140,21 @@ def test_a_coarser_mesh_is_given_up_where_walls_are_thinner_than_quads(thickness
         Request(),
         None,
     ).has_thin_walls
-    # A coarse mesh is not asked.
+    # A mesh with fewer triangles than quads is not tested.
     assert not RemeshPatch(
         TriMesh(cube()[0] * (0.9, 0.9, thickness), cube()[1]), 4000, patch.edge, Request(), None
     ).has_thin_walls
     assert not RemeshPatch(TriMesh(vertices, faces[:, ::-1]), 4000, patch.edge, Request(), None).has_thin_walls
-    # Without creases, or its narrow sides tell.
+    # No creases, since the plate's narrow sides would count as narrow strips.
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, crease_degrees=0.0))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert any("walls" in text for text in record.failed) == thin
     assert not (thin and "1 subdivision" in record.engine)
 
 
 def with_tunnel(vertices, faces, length):
-    """A ball with a tunnel, a triangle wide, from its top to a triangle about so far away."""
+    """Connect two triangles of a ball by a tunnel: the topmost one, and one about `length` away from it."""
     centre = vertices[faces].mean(1)
     top = centre[:, 2].argmax()
     other = np.abs(np.linalg.norm(centre - centre[top], axis=1) - length).argmin()
@@ -167,7 +169,7 @@ def bored_ball():
 
 
 @pytest.mark.parametrize("shape, given_up", [("a skin-deep tunnel", True), ("a bore", False)])
-def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, shape, given_up):
+def test_only_handles_finer_than_a_quad_may_be_lost(monkeypatch, shape, given_up):
     vertices, faces = sphere(96, 0.4)
     made, _ = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000, engine="split"))
     out, quads_out = made.vertices, made.faces
@@ -175,27 +177,27 @@ def test_a_handle_is_given_up_only_where_it_is_finer_than_a_quad(monkeypatch, sh
     assert topology.is_watertight(faces)
     assert topology.is_manifold(faces)
     assert topology.euler_number(faces) == 0
-    in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that makes a ball of it
+    in_this_process(monkeypatch, lambda *_: QuadMesh(out, quads_out))  # an engine that returns a ball
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=1000))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert (record.engine == "instant-meshes, handles are lost") == given_up
     assert topology.euler_number(quads_out) == (2 if given_up else 0)
 
 
-def test_torn_output_is_not_believed(monkeypatch):
+def test_torn_output_is_rejected(monkeypatch):
     # Three quads at one edge.
     book = np.array([[0, 1, 2, 3], [0, 1, 4, 5], [1, 0, 6, 7]])
     in_this_process(monkeypatch, lambda *_: QuadMesh(np.random.default_rng(0).random((8, 3)), book))
     vertices, faces = sphere(24)
     made, record = pipeline.remesh(TriMesh(vertices / 2, faces), Request(quads=300))
     quads_out = made.faces
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert record.engine == "pair and split"
     assert any("pieces are lost" in text for text in record.failed)
 
 
-def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
+def test_a_hole_with_a_quad_attached_by_one_corner_is_closed():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     corners, sides = around(faces, middle)
@@ -205,14 +207,14 @@ def test_a_hole_with_a_crumb_that_hangs_in_it_by_a_corner_is_closed():
     fault, mended = candidates.repair_and_judge(QuadMesh(vertices, torn), topology.invariants(faces))
     out, quads_out = mended.vertices, mended.faces
     assert fault is None
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert topology.components(quads_out)[0] == 1
     assert len(quads_out) < len(faces)
     assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))
 
 
-def test_candidates_are_in_the_order_of_place(monkeypatch):
-    """Whatever order an engine leaves its quads in."""
+def test_candidates_are_sorted_in_space(monkeypatch):
+    """Candidates are sorted in space, whatever the order of the engine's quads."""
     vertices, faces = quad_cube(3)
     rng = np.random.default_rng(1)
     mixed, number = rng.permutation(len(vertices)), np.empty(len(vertices), np.int64)
@@ -220,22 +222,22 @@ def test_candidates_are_in_the_order_of_place(monkeypatch):
     monkeypatch.setitem(
         candidates.ENGINES, "quadriflow", lambda *_: QuadMesh(vertices[mixed], rng.permutation(number[faces]))
     )
-    one = candidates.make_candidate(
+    candidate = candidates.make_candidate(
         TriMesh(vertices, triangulated(faces)[0]), candidates.EngineAttempt("quadriflow", 0, (1.0,), 30.0), len(faces)
     )
-    assert one.fault is None
-    assert len(one.mesh.faces) == len(faces)
+    assert candidate.fault is None
+    assert len(candidate.mesh.faces) == len(faces)
 
     def places(v, q):
         return sorted(map(tuple, v[q].reshape(len(q), 12).tolist()))
 
-    assert places(one.mesh.vertices, one.mesh.faces) == places(vertices, faces)
-    ends = topology.edges_of(one.mesh.faces).ends
-    # A third of them, on average, where it is by chance.
+    assert places(candidate.mesh.vertices, candidate.mesh.faces) == places(vertices, faces)
+    ends = topology.edges_of(candidate.mesh.faces).ends
+    # In random order the mean is a third of the number of vertices.
     assert np.abs(np.diff(ends, axis=1)).mean() < 0.3 * len(vertices) / 3
 
 
-def test_output_without_area_is_no_quads():
+def test_output_without_area_is_rejected_as_no_quads():
     vertices, faces = quad_cube(1)
     assert (
         candidates.repair_and_judge(QuadMesh(vertices, faces[:, [0, 1, 1, 0]]), topology.invariants(faces)).fault
@@ -243,7 +245,7 @@ def test_output_without_area_is_no_quads():
     )
 
 
-def test_quads_that_cut_edges_off_do_not_do():
+def test_quads_that_cut_off_edges_are_rejected():
     vertices, faces = quad_cube(3)
     surface, edge = ProjectionTarget(TriMesh(vertices, triangulated(faces)[0])), 0.125 * np.ptp(vertices[:, 0])
     assert rejection_reason(QuadMesh(vertices, faces), surface, edge, 1.0, 0.005)[0] is None
@@ -254,22 +256,24 @@ def test_quads_that_cut_edges_off_do_not_do():
     assert rejection_reason(QuadMesh(cut, faces), surface, edge, 1.0, 0.005)[0].startswith("cuts off")
 
 
-def test_surface_that_the_quads_do_without_is_measured():
+def test_uncovered_surface_is_measured():
     vertices, faces = cube()
     lid = faces[np.all(vertices[faces][:, :, 2] == vertices[:, 2].max(), 1)]
-    rest = np.array([f for f in faces.tolist() if f not in lid.tolist()])
+    open_faces = np.array([f for f in faces.tolist() if f not in lid.tolist()])
     surface = ProjectionTarget(TriMesh(vertices, faces))
-    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, rest))
+    closed, opened = (np.concatenate([f, np.full((len(f), 1), -1)], 1) for f in (faces, open_faces))
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, closed)), surface, (0.1,)) == [0]
-    # The lid but its rim.
+    # All of the lid except a strip along its rim.
     assert uncovered_shares(target_of_quads(QuadMesh(vertices, opened)), surface, (0.1, 2.0)) == pytest.approx(
         [0.8**2 / 6, 0], abs=0.02
     )
 
 
-def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_finer_one_comes(monkeypatch):
-    """Of a coarser mesh subdivided less is put up with than of a finer one, for the finer one comes after it; where it
-    does not, it is better than none."""
+def test_a_subdivided_result_within_wider_limits_is_taken_if_no_finer_one_comes(monkeypatch):
+    """The limits of subdivided results are stricter, since attempts without subdivision follow.
+
+    If all of these fail, a subdivided result within the wider limits is taken.
+    """
 
     engine = candidates.ENGINES["instant-meshes"]
 
@@ -283,40 +287,40 @@ def test_a_subdivided_result_that_would_do_as_a_finer_one_is_taken_where_no_fine
     monkeypatch.setattr(
         candidates,
         "rejection_reason",
-        lambda *given: ("cuts off 0.7% of the surface" if given[-1] < 0.007 else None, 0.5),
+        lambda *arguments: ("cuts off 0.7% of the surface" if arguments[-1] < 0.007 else None, 0.5),
     )
     vertices, faces = sphere(96, 0.45)
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))
     quads_out = made.faces
     assert record.engine == "instant-meshes, 1 subdivision"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert "cuts off" in record.failed[0]
     assert "SIGSEGV" in record.failed[1]
     assert sum(not attempt.subdivisions for _, attempt, _ in calls) == 1
-    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # farther than that it is not unfolded
+    monkeypatch.setattr(candidates, "FAR_SUBDIVIDED", 0.4)  # fitting stops beyond this distance
     assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
     monkeypatch.undo()
     in_this_process(monkeypatch)
     monkeypatch.setitem(candidates.ENGINES, "instant-meshes", torn)
-    monkeypatch.setattr(candidates, "rejection_reason", lambda *given: ("cuts off 2% of the surface", 0.5))
+    monkeypatch.setattr(candidates, "rejection_reason", lambda *arguments: ("cuts off 2% of the surface", 0.5))
     assert pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000))[1].engine == "pair and split"
 
 
-def test_when_the_time_is_over_no_engine_is_begun():
-    """What was asked for comes all the same, as paired triangles, and the record says why."""
+def test_no_engine_is_started_when_the_time_is_over():
+    """The quads are still made, of paired triangles, and the record has the reason."""
     vertices, faces = sphere(96, 0.45)
     start = time.monotonic()
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, seconds=0.0))
     quads_out = made.faces
     assert record.engine == "pair and split"
     assert record.failed == ["instant-meshes, 1 subdivision: not tried, the time is over"]
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert abs(len(quads_out) / 4000 - 1) <= 0.03
     assert time.monotonic() - start < 30
 
 
-def test_every_round_asks_for_two_densities():
+def test_every_round_requests_two_counts():
     attempt = search._attempts(20000, Request())[0]
     assert len(attempt.counts_around(20000)) == 2
     assert np.mean(attempt.counts_around(20000)) == pytest.approx(20000)
@@ -325,9 +329,11 @@ def test_every_round_asks_for_two_densities():
     )
 
 
-def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_many():
-    """An engine's count may jump by a twentieth: in proportion to the last answer what gave too many would be asked for
-    again."""
+def test_the_next_request_lies_between_too_few_and_too_many():
+    """An engine's count can jump by 5 %.
+
+    A request in proportion to the last answer would repeat a request that gave too many.
+    """
     answers = [search.EngineAnswer(19700.0, 20868), search.EngineAnswer(20100.0, 21164)]
     assert search._interpolate_request(answers, 20000) is None
     assert search._interpolate_request(answers, 22000) is None
@@ -335,11 +341,13 @@ def test_what_is_asked_next_lies_between_what_gave_too_few_and_what_gave_too_man
     assert search._interpolate_request(answers, 20000) == pytest.approx(19186, abs=1)
 
 
-def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypatch):
-    """The first in rank where it will do, without a look at the other, and the other first where the first's outline
-    leaves out more; where none does, what comes nearest to it."""
+def test_the_first_good_candidate_is_taken(monkeypatch):
+    """The first in rank is taken without fitting the other, if it is good.
+
+    The other goes first if the first is not promising. If none is good, the nearest to the surface is taken.
+    """
     attempt = search._attempts(20000, Request())[0]
-    drawn = []
+    fitted = []
 
     def candidate(far, least, wrong=None, outline=0.5):
         quads_out = Candidate(
@@ -354,34 +362,36 @@ def test_of_two_candidates_the_first_is_taken_that_leaves_no_corner_out(monkeypa
         quads_out.asked_of_outline = outline
         return quads_out
 
-    def snap_to_features(one, patch):
-        one.snapped = one.asked_of_outline
-        return one.snapped < 1
+    def snap_to_features(taken, patch):
+        taken.snapped = taken.asked_of_outline
+        return taken.snapped < 1
 
     monkeypatch.setattr(Candidate, "is_promising", snap_to_features)
-    monkeypatch.setattr(Candidate, "fit", lambda one, patch: drawn.append(one))
+    monkeypatch.setattr(Candidate, "fit", lambda taken, patch: fitted.append(taken))
     choose = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 1000, 0.1, Request(), None), Record())._fit_first_good
-    good, better, bare, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
+    good, better, far, thin = candidate(0.5, 0.3), candidate(0.1, 0.9), candidate(0.9, 0.5), candidate(0.3, 0.1)
     assert choose([good, better]) is good
-    assert drawn == [good]
-    assert choose([bare, good]) is good
+    assert fitted == [good]
+    assert choose([far, good]) is good
     assert choose([candidate(0.1, 0.9, "leaves out 1 % of the surface"), thin]) is thin
-    assert choose([bare, thin]) is bare
+    assert choose([far, thin]) is far
     assert choose([candidate(2.0, 0.5), thin]) is thin
-    drawn.clear()
+    fitted.clear()
     late = candidate(0.9, 0.3, outline=1.1)
     assert choose([late, good]) is good
-    assert drawn == [good]
+    assert fitted == [good]
     late.snapped = None
-    drawn.clear()
+    fitted.clear()
     assert choose([late, candidate(2.0, 0.5)]) is late
-    assert drawn[1] is late
-    assert len(drawn) == 2
+    assert fitted[1] is late
+    assert len(fitted) == 2
 
 
-def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
-    """What has too many quads with those of its tips is not drawn; another that has as many tips but fewer quads is,
-    and only then a new one asked for."""
+def test_the_count_includes_tips_before_fitting(monkeypatch):
+    """A candidate with too many quads, tips included, is not fitted.
+
+    The next candidate with fewer quads is fitted before a new request is made.
+    """
     attempt = search._attempts(20000, Request())[0]
     search_run = search.EngineSearch(RemeshPatch(TriMesh(*cube()), 4000, 0.1, Request(), None), Record())
 
@@ -398,7 +408,7 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
         )
         return quads_out
 
-    monkeypatch.setattr(Candidate, "snap", lambda one, patch: setattr(one, "snapped", one.traced))
+    monkeypatch.setattr(Candidate, "snap", lambda taken, patch: setattr(taken, "snapped", taken.traced))
     plain, far, fewer = candidate(4000, 0), candidate(4100, 100), candidate(3900, 100)
     assert next(search_run._with_right_count([plain, far], 0)) is plain
     assert far.snapped is None
@@ -408,9 +418,8 @@ def test_the_quads_of_tips_count_before_any_are_drawn(monkeypatch):
     assert list(search_run._with_right_count([hopeless := candidate(4100, 100, hopeless=True)], 0)) == [hopeless]
 
 
-def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypatch):
-    """A plate hardly thicker than a quad: the engine is asked at full density alone, both rims are met, and the record
-    says so."""
+def test_subdivision_is_not_tried_where_creases_are_closer_than_a_quad(monkeypatch):
+    """A plate hardly thicker than a quad: only full density is requested, and both rims are met."""
     calls = in_this_process(monkeypatch)
     vertices, faces = cube()
     vertices = vertices * (1, 0.8, 0.02)
@@ -419,7 +428,7 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     assert all(not attempt.subdivisions for _, attempt, _ in calls)
     assert "not tried, its quads are wider" in record.failed[0]
     assert record.engine == "instant-meshes"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     corners = vertices[np.abs(vertices[:, None] - out[None]).max(-1).min(1) < 1e-9]
     assert len(corners) == 8
     assert uncovered_shares(
@@ -427,20 +436,20 @@ def test_coarser_quads_are_not_tried_where_creases_lie_closer_together(monkeypat
     ) == [0.0]
 
 
-@pytest.mark.parametrize("given, least, most", [(16000, 2000, 2500), (500, 500, 500)])
-def test_an_engine_has_a_memory_limit_of_its_own_within_the_request(monkeypatch, given, least, most):
-    """It follows the quads and triangles: Instant Meshes fills some holes for ever."""
+@pytest.mark.parametrize("memory_mb, least, most", [(16000, 2000, 2500), (500, 500, 500)])
+def test_an_engine_has_its_own_memory_limit_within_the_requests(monkeypatch, memory_mb, least, most):
+    """The limit follows the number of quads and triangles, because Instant Meshes fills some holes for ever."""
     limits = []
 
-    def begin(*_, memory_mb, **more):
+    def begin(*_, memory_mb, **options):
         limits.append(memory_mb)
         return Ended(ChildFailed("ran out"))
 
     monkeypatch.setattr(search, "begin", begin)
     vertices, faces = sphere(48, 0.45)
-    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, memory_mb=given))
+    made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=4000, memory_mb=memory_mb))
     quads_out = made.faces
     assert limits
     assert all(least <= limit <= most for limit in limits)
     assert record.engine == "pair and split"
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)

@@ -1,4 +1,4 @@
-"""Quads drawn onto a surface: what is known of their vertices is known of them still when some are gone."""
+"""Fitting quads: constraints and tips stay those of their vertices after quads were collapsed."""
 
 import numpy as np
 
@@ -10,20 +10,20 @@ from gdtool.remesh.task import Request
 from tests.geometry.solids import quad_cube
 
 
-def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
+def test_tips_are_found_again_after_folded_quads_were_collapsed(monkeypatch):
     vertices, quads = quad_cube(2)
     fixed, tips, gone = np.array([3, 11, 20, 40]), np.array([11, 40]), 7
     constraints = Constraints.none(len(vertices))
     constraints.fixed[fixed] = True
-    eased = []
+    released = []
 
     def without_one(mesh, surface, constraints):
-        """A vertex becomes another, a quad is gone."""
+        """Merge a vertex into another, and remove a quad."""
         number = np.arange(len(vertices)) - (np.arange(len(vertices)) > gone)
-        kept = np.delete(np.arange(len(vertices)), gone)
+        remaining = np.delete(np.arange(len(vertices)), gone)
         return (
-            QuadMesh(mesh.vertices[kept], number[np.where(mesh.faces == gone, 0, mesh.faces)][1:]),
-            Constraints(constraints.curve[kept], constraints.fixed[kept], *held[2:]),
+            QuadMesh(mesh.vertices[remaining], number[np.where(mesh.faces == gone, 0, mesh.faces)][1:]),
+            Constraints(constraints.curve[remaining], constraints.fixed[remaining], *held[2:]),
         )
 
     held = constraints.curve, constraints.fixed, constraints.path, constraints.path_curve
@@ -42,7 +42,7 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
     monkeypatch.setattr(
         shaping,
         "release_and_smooth",
-        lambda mesh, *given, tips, **_: eased.append(mesh.vertices[tips]) or (mesh.vertices, given[2]),
+        lambda mesh, *arguments, tips, **_: released.append(mesh.vertices[tips]) or (mesh.vertices, arguments[2]),
     )
     for jacobian in (0.1, -0.1):
         monkeypatch.setattr(
@@ -51,6 +51,6 @@ def test_tips_stay_where_folded_quads_before_them_are_taken_out(monkeypatch):
         shaping.fit_to_surface(
             SnappedQuads(QuadMesh(vertices, quads), constraints, tips, 0.1, 0.0, 1.0, False), None, None, Request()
         )
-    # of the folded ones alone
-    assert len(eased) == 1
-    assert np.array_equal(eased[0], vertices[tips])
+    # only for the quads that are folded
+    assert len(released) == 1
+    assert np.array_equal(released[0], vertices[tips])

@@ -1,4 +1,4 @@
-"""Pieces that nearly touch are remeshed as if they were alone."""
+"""Pieces that nearly touch are remeshed as if each were alone."""
 
 import numpy as np
 
@@ -16,8 +16,8 @@ def boxes(*sizes_and_centres):
     return joined(*((box * size + centre, faces) for size, centre in sizes_and_centres))
 
 
-def test_pieces_are_laid_apart_and_brought_back():
-    """Side by side, one inside the other, and of unlike size."""
+def test_pieces_are_moved_apart_and_back():
+    """Boxes side by side, one inside another, and of different sizes."""
     vertices, faces = boxes(
         ((0.4, 0.3, 0.5), (0, 0, 0)),
         ((0.4, 0.3, 0.5), (0, 0.301, 0)),
@@ -38,15 +38,17 @@ def test_pieces_are_laid_apart_and_brought_back():
     assert np.abs(apart.to_original(middle) - vertices[faces].mean(1)).max() < 1e-12
 
 
-def test_what_is_one_piece_or_apart_as_it_is_stays():
+def test_one_piece_or_pieces_far_apart_are_not_moved():
     assert separate_pieces(TriMesh(*cube()), 0.1) is None
     assert separate_pieces(TriMesh(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0)))), 0.1) is None
     assert separate_pieces(TriMesh(*boxes((0.3, (0, 0, 0)), (0.3, (0, 0.5, 0)))), 0.25) is not None
 
 
-def test_quads_of_one_piece_are_not_drawn_onto_another():
-    """Two balls, one in the other, a tenth of a quad apart: each keeps its radius. Not laid apart both come to lie
-    between the two."""
+def test_quads_of_one_piece_are_not_fitted_to_another():
+    """Two balls, one in the other, a tenth of a quad apart: each keeps its radius.
+
+    If they were not moved apart, the quads of both would lie between the two.
+    """
     vertices, faces = joined(sphere(48, 0.4), sphere(48, 0.397))
     made, record = pipeline.remesh(TriMesh(vertices, faces), Request(quads=3000))
     out, quads_out = made.vertices, made.faces

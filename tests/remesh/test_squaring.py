@@ -1,4 +1,4 @@
-"""Squaring quads: folds undone on the surface, straight corners let off their curves."""
+"""Squaring quads: folds are undone on the surface, and straight corners are released from their curves."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def grid(n=8):
     return np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1), np.stack([i, i + 1, i + n + 2, i + n + 1], -1)
 
 
-def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
+def test_folded_quads_are_unfolded_on_the_surface():
     vertices, quads = grid()
     bent = vertices.copy()
     bent[40] += [0.19, 0.17, 0]  # past its neighbour
@@ -36,19 +36,21 @@ def test_folded_quads_are_turned_over_again_and_stay_on_the_surface():
     assert np.array_equal(out[rim], vertices[rim])
 
 
-def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
+def test_the_middle_of_three_corners_in_a_line_is_released_from_its_curve():
     vertices, quads = grid()
-    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then round a quad's corner at 40
+    path = np.array([[38, 39], [39, 40], [40, 49], [49, 50]])  # straight, then around a quad's corner at 40
     curve = np.full(len(vertices), -1)
     curve[[39, 40, 49]] = 0
     fixed = np.zeros(len(vertices), bool)
     fixed[[38, 50]] = True
-    found = release_straight_corners(QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64)))
-    assert found.curve[40] == -1
-    assert found.curve[49] == -1
-    assert found.curve[39] == 0
-    assert found.path.tolist() == [[38, 39]]
-    assert found.fixed[[38, 50]].all()
+    released = release_straight_corners(
+        QuadMesh(vertices, quads), Constraints(curve, fixed, path, np.zeros(4, np.int64))
+    )
+    assert released.curve[40] == -1
+    assert released.curve[49] == -1
+    assert released.curve[39] == 0
+    assert released.path.tolist() == [[38, 39]]
+    assert released.fixed[[38, 50]].all()
     fixed[[40, 49]] = True  # true corners of the surface, square here: they stay
     assert (
         len(
@@ -60,47 +62,52 @@ def test_middle_of_three_corners_in_a_row_is_let_off_its_curve():
     )
 
 
-def test_a_corner_pinned_in_the_wrong_place_is_eased():
+def test_a_corner_pinned_in_the_wrong_place_is_released():
     vertices, quads = grid()
     bent = vertices.copy()
     bent[40] = bent[50] + [0.01, 0.01, 0]
     fixed = np.zeros(len(vertices), bool)
     fixed[40] = True
     pinned = Constraints(np.full(len(vertices), -1), fixed, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
-    out, left = release_and_smooth(QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned)
+    out, constraints = release_and_smooth(
+        QuadMesh(bent, quads), ProjectionTarget(TriMesh(*plane())), NO_FEATURES, pinned
+    )
     assert scaled_jacobian(QuadMesh(out, quads)).min() >= 0.2
-    assert not left.fixed[40]
+    assert not constraints.fixed[40]
 
 
 @pytest.mark.parametrize("moved, by", [(49, (0.1, -0.1, 0)), (41, (0, 0.2, 0))])
 @pytest.mark.parametrize("height", [0.15, 0.25])
-def test_a_tip_beside_folded_quads_stays_where_easing_would_draw_it_back(height, moved, by):
+def test_a_tip_beside_folded_quads_stays_where_smoothing_would_shrink_it(height, moved, by):
     vertices, quads = grid()
     tip = 40
     vertices[tip, 2] = height
     triangles = triangulated(quads)[0]
-    surface, held = ProjectionTarget(TriMesh(vertices, triangles.astype(np.int64))), Constraints.none(len(vertices))
-    held.fixed[tip] = True
+    surface, constraints = (
+        ProjectionTarget(TriMesh(vertices, triangles.astype(np.int64))),
+        Constraints.none(len(vertices)),
+    )
+    constraints.fixed[tip] = True
     bent = vertices.copy()
     bent[moved] += by
     bent = surface.closest(bent)[2]
     assert scaled_jacobian(QuadMesh(bent, quads)).min() < 0
 
-    def bare(out):
+    def uncovered_edges(out):
         return closest_points(vertices[[tip]], TriMesh(out, triangles))[0][0] * 8  # edges are 1/8 long
 
-    out, left = release_and_smooth(QuadMesh(bent, quads), surface, NO_FEATURES, held)
+    out, remaining = release_and_smooth(QuadMesh(bent, quads), surface, NO_FEATURES, constraints)
     assert scaled_jacobian(QuadMesh(out, quads)).min() > 0.5
-    assert bare(out) < 1e-9
-    assert left.fixed[tip]
-    out, left = release_and_smooth(
-        QuadMesh(bent, quads), surface, NO_FEATURES, held, options=ReleaseOptions(max_uncovered_edges=2.0)
+    assert uncovered_edges(out) < 1e-9
+    assert remaining.fixed[tip]
+    out, remaining = release_and_smooth(
+        QuadMesh(bent, quads), surface, NO_FEATURES, constraints, options=ReleaseOptions(max_uncovered_edges=2.0)
     )
-    assert 0.75 < bare(out) < 2
-    assert not left.fixed[tip]
+    assert 0.75 < uncovered_edges(out) < 2
+    assert not remaining.fixed[tip]
 
 
-def test_easing_folds_nothing_that_was_not_folded():
+def test_releasing_folds_no_further_quads():
     vertices, quads = grid()
     for seed in range(20):
         rng = np.random.default_rng(seed)

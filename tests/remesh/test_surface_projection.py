@@ -1,4 +1,4 @@
-"""Shaping: figures, subdivision, doublets, holes."""
+"""Projection to the surface: figures of quads, subdivision, doublets, holes."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from gdtool.geometry.meshes import QuadMesh
 from gdtool.geometry.topology import triangulated
 from gdtool.remesh.fit.surface_projection import fill_holes, remove_doublets, subdivide
 from tests.geometry.solids import cube, quad_cube, volume
-from tests.remesh.engines import around, inner_face, whole
+from tests.remesh.engines import around, inner_face, is_watertight_manifold
 
 
 def test_grid_figures():
@@ -31,7 +31,7 @@ def test_subdivision_of_a_cube_is_regular_but_for_eight_corners():
     made, _ = subdivide(QuadMesh(vertices, quad))
     out, quads_out = made.vertices, made.faces
     assert len(quads_out) == 24
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert volume(out, quads_out) == pytest.approx(1)
     assert topology_figures(QuadMesh(out, quads_out))["irregular_share"] == pytest.approx(8 / 26)
     mixed = np.concatenate([np.concatenate([faces, np.full((12, 1), -1)], 1)[[1, 2]], quad[2:]])
@@ -46,7 +46,7 @@ def test_doublet_is_removed():
     assert len(out) == 2
 
 
-def test_two_holes_that_meet_at_a_vertex_are_closed_each_by_itself():
+def test_two_holes_that_meet_at_a_vertex_are_closed_separately():
     vertices, faces = quad_cube(3)
     middle = inner_face(vertices, faces)
     open_faces = np.delete(faces, [middle, around(faces, middle)[0][0]], 0)
@@ -54,5 +54,5 @@ def test_two_holes_that_meet_at_a_vertex_are_closed_each_by_itself():
     out, quads_out = made.vertices, made.faces
     assert len(out) == len(vertices)
     assert len(quads_out) == len(faces)
-    assert whole(quads_out)
+    assert is_watertight_manifold(quads_out)
     assert volume(out, triangulated(quads_out)[0]) == pytest.approx(volume(vertices, triangulated(faces)[0]))

@@ -1,4 +1,4 @@
-"""Mirror planes found or not, meshes cut at them, halves joined."""
+"""Mirror planes: found or not, meshes cut at them, and halves joined."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_half_has_half_the_area_and_ends_at_the_plane(axis):
     assert len(rim) > 10
 
 
-def test_mirror_planes_are_found_and_missed():
+def test_mirror_planes_are_found_only_where_the_mesh_is_symmetric():
     vertices, faces = sphere(24, 0.45)
     assert mirror_plane(TriMesh(vertices, faces), 2000)[0] is not None
     vertices = np.where(vertices > 0.3, 0.3 + 0.5 * (vertices - 0.3), vertices)  # three sides flattened

@@ -1,4 +1,4 @@
-"""Tips: what sticks out of quads is drawn out of them, and nothing else changes."""
+"""Tips: quads are extruded over parts of the surface that stick out, and nothing else changes."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from tests.remesh.engines import in_this_process
 
 
 def horned(length, width=0.05, bend=0.0):
-    """A sphere of radius 0.4 with a horn at +x, whose middle line bends toward +y."""
+    """Make a sphere of radius 0.4 with a horn at +x that bends toward +y."""
     vertices, faces = sphere(160, 0.4)
     away = np.linalg.norm(vertices[:, 1:], axis=1)
     horn = (vertices[:, 0] > 0) & (away < width)
@@ -31,7 +31,7 @@ def horned(length, width=0.05, bend=0.0):
 
 
 def ball(rounds=4):
-    """Quads on the sphere of radius 0.4, and their edge length."""
+    """Make quads on the sphere of radius 0.4; also return their edge length."""
     vertices, faces = quad_cube(rounds)
     vertices = vertices - vertices.mean(0)
     vertices *= 0.4 / np.linalg.norm(vertices, axis=1, keepdims=True)
@@ -39,7 +39,7 @@ def ball(rounds=4):
 
 
 @pytest.mark.parametrize("length, bend", [(0.08, 0.0), (0.25, 0.0), (0.25, 0.15)])
-def test_a_horn_is_drawn_out(length, bend):
+def test_quads_are_extruded_over_a_horn(length, bend):
     vertices, faces, edge = ball()
     surface = ProjectionTarget(TriMesh(*horned(length, bend=bend)))
     assert max_distance(target_of_quads(QuadMesh(vertices, faces)), surface) > 1.4 * edge
@@ -57,13 +57,13 @@ def test_a_horn_is_drawn_out(length, bend):
     assert len(constraints.curve) == len(out)
     apex = surface.vertices[surface.vertices[:, 0].argmax()]
     assert np.linalg.norm(out[tips] - apex, axis=1).min() < 0.9 * edge
-    # The quads away from the horn are those that were there.
+    # Quads away from the horn are unchanged.
     same = (vertices == out[: len(vertices)]).all(1)
     assert same.sum() > 0.97 * len(vertices)
     assert (vertices[~same, 0] > 0.3).all()
 
 
-def test_no_more_quads_than_allowed_are_spent():
+def test_no_more_quads_than_allowed_are_added():
     vertices, faces, edge = ball()
     quads_out = extrude_tips(
         QuadMesh(vertices, faces),
@@ -72,10 +72,10 @@ def test_no_more_quads_than_allowed_are_spent():
         edge,
         max_added=0.01,
     ).mesh.faces
-    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # those of the step that went over it
+    assert 0 < len(quads_out) - len(faces) < 0.01 * len(faces) + 40  # 40: quads of the last step
 
 
-def test_what_is_near_enough_is_left_alone():
+def test_surface_near_the_quads_is_not_extruded():
     vertices, faces, edge = ball()
     surface = ProjectionTarget(TriMesh(*horned(0.4 * edge)))
     made, _, tips, far, _ = extrude_tips(QuadMesh(vertices, faces), Constraints.none(len(vertices)), surface, edge)
@@ -86,13 +86,12 @@ def test_what_is_near_enough_is_left_alone():
     assert far == pytest.approx(0.4 * edge, rel=0.2)
 
 
-def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
-    """Creases have most of a simplified mesh's vertices: what is cut off along them is little of the surface all the
-    same."""
+def test_uncovered_surface_is_measured_by_area_and_not_by_vertices():
+    """Most vertices of a simplified mesh lie at creases, though little of its area is cut off there."""
     vertices, faces, edge = ball()
     fine, triangles = sphere(160, 0.4)
     narrow = fine[:, 0] > 0.39
-    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than what makes a tip
+    fine = np.where(narrow[:, None], fine * (1 + 0.4 * edge / 0.4), fine)  # lifted by less than the height of a tip
     many = ProjectionTarget(TriMesh(*_cut_in_four(fine, triangles, narrow[triangles].all(1), 3)))
     assert (many.vertices[:, 0] > 0.39).mean() > 0.5
     far, away = extrude_tips(QuadMesh(vertices, faces), Constraints.none(len(vertices)), many, edge)[3:]
@@ -104,17 +103,17 @@ def test_what_is_bare_is_told_by_area_and_not_by_how_many_vertices_are_there():
 
 
 def _cut_in_four(vertices, faces, which, rounds):
-    """Some of the faces cut at the middles of their edges, without those beside them."""
-    own, rest = faces[which], faces[~which]
+    """Cut some faces, which (f,) bool, in four at the middles of their edges, but not the faces beside them."""
+    cut, others = faces[which], faces[~which]
     for _ in range(rounds):
-        a, b, c = (vertices[own[:, i]] for i in range(3))
-        n, k = len(vertices), np.arange(len(own))
-        ab, bc, ca = n + k, n + len(own) + k, n + 2 * len(own) + k
+        a, b, c = (vertices[cut[:, i]] for i in range(3))
+        n, k = len(vertices), np.arange(len(cut))
+        ab, bc, ca = n + k, n + len(cut) + k, n + 2 * len(cut) + k
         vertices = np.concatenate([vertices, (a + b) / 2, (b + c) / 2, (c + a) / 2])
-        own = np.concatenate(
-            [np.stack(x, -1) for x in ((own[:, 0], ab, ca), (ab, own[:, 1], bc), (ca, bc, own[:, 2]), (ab, bc, ca))]
+        cut = np.concatenate(
+            [np.stack(x, -1) for x in ((cut[:, 0], ab, ca), (ab, cut[:, 1], bc), (ca, bc, cut[:, 2]), (ab, bc, ca))]
         )
-    return vertices, np.concatenate([own, rest])
+    return vertices, np.concatenate([cut, others])
 
 
 def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
@@ -132,17 +131,17 @@ def test_one_vertex_reaches_a_tip_that_is_less_than_an_edge_away():
     assert (out == vertices).all(1).sum() == len(vertices) - 1
 
 
-def test_paths_along_creases_end_where_a_tip_is_drawn_out():
-    """A path over the tip is no path of edges any more; the rest of it holds."""
+def test_paths_along_creases_end_where_a_tip_is_extruded():
+    """A path over the tip no longer consists of edges; the rest of the path is kept."""
     vertices, faces, edge = ball()
     around = np.flatnonzero(np.abs(vertices[:, 2]) < 1e-9)
     around = around[np.argsort(np.arctan2(vertices[around, 1], vertices[around, 0]))]
     path = np.stack([around, np.roll(around, -1)], -1)
     curve = np.full(len(vertices), -1)
     curve[around] = 0
-    held = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
+    path_constraints = Constraints(curve, np.zeros(len(vertices), bool), path, np.zeros(len(path), int))
     made, constraints, tips, _, _ = extrude_tips(
-        QuadMesh(vertices, faces), held, ProjectionTarget(TriMesh(*horned(0.2))), edge
+        QuadMesh(vertices, faces), path_constraints, ProjectionTarget(TriMesh(*horned(0.2))), edge
     )
     quads_out = made.faces
     edges = set(map(tuple, topology.edges_of(quads_out).ends.tolist()))
@@ -151,11 +150,11 @@ def test_paths_along_creases_end_where_a_tip_is_drawn_out():
     assert (constraints.curve[tips] < 0).all()
 
 
-def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
+def test_an_engine_that_cuts_a_horn_short_is_still_accepted(monkeypatch):
     vertices, faces = horned(0.35, 0.04)
-    asked = Request(quads=2000)
+    request = Request(quads=2000)
     edge = (4 * np.pi * 0.4**2 / 2000) ** 0.5
-    made, record = pipeline.remesh(TriMesh(vertices, faces), asked)
+    made, record = pipeline.remesh(TriMesh(vertices, faces), request)
     out, quads_out = made.vertices, made.faces
     figures = distance_figures(TriMesh(out, triangulated(quads_out)[0]), TriMesh(vertices, faces), 20000)
     assert "instant-meshes" in record.engine
@@ -167,14 +166,14 @@ def test_an_engine_that_cuts_a_horn_short_is_still_taken(monkeypatch):
     monkeypatch.setattr(
         shaping, "extrude_tips", lambda mesh, constraints, *_: ExtrudedQuads(mesh, constraints, None, 0.0, np.zeros(1))
     )
-    assert pipeline.remesh(TriMesh(vertices, faces), asked)[1].engine == "pair and split"
+    assert pipeline.remesh(TriMesh(vertices, faces), request)[1].engine == "pair and split"
 
 
-def test_what_is_held_on_a_blunt_tip_leaves_room_for_quads():
-    """Held as near to each other as the points that they were drawn to, they leave quads between them without area."""
+def test_fixed_vertices_on_a_blunt_tip_leave_room_for_quads():
+    """Vertices fixed as near to each other as their target points would leave quads without area between them."""
     vertices, faces, edge = ball()
     fine, triangles = sphere(160, 0.4)
-    # A ridge some edges wide and a tenth of that thick: all vertices of its cap are drawn about as far.
+    # A ridge some edges wide and a tenth of that thick: all vertices of its cap move about equally far.
     blunt = (fine[:, 0] > 0) & (abs(fine[:, 1]) < 2.2 * edge) & (abs(fine[:, 2]) < 0.4 * edge)
     fine[blunt, 0] += 1.4 * edge
     made, _, tips, _, _ = extrude_tips(

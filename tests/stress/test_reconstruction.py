@@ -20,7 +20,6 @@ from gdtool.folders.surface import read_surface
 from gdtool.folders.views import Views
 from gdtool.geometry.distance import closest_points
 from gdtool.geometry.grids import components, signed_volume
-from gdtool.geometry.meshes import TriMesh
 from tests.fields.shapes import cube, sphere, torus, two_balls, views_folder, views_of
 
 SIZE = 48
@@ -52,10 +51,10 @@ def reconstruct(cameras, images, mask):
 
 
 def check_whole(shape, reach=0.75):
-    assert np.isfinite(shape.vertices).all()
-    assert np.abs(shape.vertices).max() < reach
-    assert is_closed_manifold(shape.faces)
-    assert signed_volume(TriMesh(shape.vertices, shape.faces)) > 0
+    assert np.isfinite(shape.mesh.vertices).all()
+    assert np.abs(shape.mesh.vertices).max() < reach
+    assert is_closed_manifold(shape.mesh.faces)
+    assert signed_volume(shape.mesh) > 0
 
 
 def picked(views, keep):
@@ -70,15 +69,15 @@ def picked(views, keep):
 def test_awkward_solids(seen, name, pieces):
     shape = reconstruct(*seen[name])
     check_whole(shape)
-    assert components(shape.faces, len(shape.vertices)).max() + 1 == pieces
-    assert np.abs(SOLIDS[name](shape.vertices)).mean() < 0.7 * shape.step
+    assert components(shape.mesh.faces, len(shape.mesh.vertices)).max() + 1 == pieces
+    assert np.abs(SOLIDS[name](shape.mesh.vertices)).mean() < 0.7 * shape.step
 
 
 @pytest.mark.parametrize("name", ["sphere", "cube", "torus", "two_balls"])
 def test_symmetric_solids_stay_symmetric(seen, name):
     """The rig is its own mirror image, left and right."""
     shape = reconstruct(*seen[name])
-    apart = closest_points(shape.vertices[::10] * [-1, 1, 1], TriMesh(shape.vertices, shape.faces))[0]
+    apart = closest_points(shape.mesh.vertices[::10] * [-1, 1, 1], shape.mesh)[0]
     assert apart.mean() < 0.02 * shape.step
     assert np.quantile(apart, 0.99) < 0.3 * shape.step
 
@@ -89,7 +88,7 @@ def test_one_view_missing(seen, missing):
     for name in ("torus", "two_balls"):
         shape = reconstruct(*picked(seen[name], keep))
         check_whole(shape)
-        assert np.abs(SOLIDS[name](shape.vertices)).mean() < shape.step
+        assert np.abs(SOLIDS[name](shape.mesh.vertices)).mean() < shape.step
 
 
 def test_a_doubled_view_changes_little(seen):
@@ -97,7 +96,7 @@ def test_a_doubled_view_changes_little(seen):
     shape = reconstruct(*picked(seen["torus"], [0, 1, 1, 2, 3, 4, 5]))
     check_whole(shape)
     once = reconstruct(cameras, images, mask)
-    assert closest_points(shape.vertices[::10], TriMesh(once.vertices, once.faces))[0].mean() < 0.1 * shape.step
+    assert closest_points(shape.mesh.vertices[::10], once.mesh)[0].mean() < 0.1 * shape.step
 
 
 @pytest.mark.parametrize("view", [1, 3])
@@ -112,11 +111,7 @@ def test_a_mirrored_view(seen, view):
         stack[view] = stack[view][:, ::-1]
     shape = reconstruct(cameras, images, mask)
     check_whole(shape)
-    assert (
-        0.3
-        < signed_volume(TriMesh(shape.vertices, shape.faces)) / signed_volume(TriMesh(true.vertices, true.faces))
-        < 2
-    )
+    assert 0.3 < signed_volume(shape.mesh) / signed_volume(true.mesh) < 2
 
 
 def test_sixty_four_pixels():
@@ -132,7 +127,7 @@ def test_sizes(size):
 def check_size(size):
     shape = reconstruct(*views_of(torus, size, 1))
     check_whole(shape)
-    assert np.abs(torus(shape.vertices)).mean() < 0.1 * 1.44 / size + 2e-5
+    assert np.abs(torus(shape.mesh.vertices)).mean() < 0.1 * 1.44 / size + 2e-5
 
 
 def views_of_a_ball(size, radius=0.5):
@@ -175,7 +170,7 @@ def check_disturbed(seen, seeds, most=0.015):
         views = perturbed(Views(cameras, images, mask), Perturbation(seed, (1 / 16, 1 / 8, 1 / 4)[seed % 3]))
         shape = reconstruct(cameras, views.images, views.mask)
         check_whole(shape)
-        assert np.abs(SOLIDS[name](shape.vertices)).mean() < most + shape.step * (name == "card"), (seed, name)
+        assert np.abs(SOLIDS[name](shape.mesh.vertices)).mean() < most + shape.step * (name == "card"), (seed, name)
 
 
 def test_disturbed_views(seen):

@@ -1,4 +1,4 @@
-"""Charts as cells: none that a chart touches is missed, and a place found is free."""
+"""Charts as bit masks: no cell that a chart touches is missed, and the places found are free."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RING_TRIANGLES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7]
 
 
 @pytest.mark.parametrize("gap", [0.0, 1.7])
-def test_a_mask_holds_all_that_the_chart_covers_and_the_gap_but_not_its_hole(gap):
+def test_a_mask_covers_the_chart_and_the_gap_but_not_its_hole(gap):
     rim = outline_of(RING, RING_TRIANGLES)
     assert len(rim) == 8
     masks, at = rotated_masks(rim, RING, 4.0, gap)
@@ -20,15 +20,15 @@ def test_a_mask_holds_all_that_the_chart_covers_and_the_gap_but_not_its_hole(gap
         size = max(mask.shape)
         covered = owner_count(uv / size, RING_TRIANGLES, size)[: mask.shape[0], : mask.shape[1]] > 0
         assert (mask | ~covered).all()
-        # Half a gap around it, and at most a cell and a half more.
+        # The mask has half a gap around the chart, and at most a cell and a half more.
         assert mask.sum() <= (4 * 9 + gap + 3) * (4 * 7 + gap + 3) - (4 * 5 - gap - 3) * (4 * 3 - gap - 3)
         assert not mask[tuple(np.array(mask.shape) // 2)]
-    # By half a cell: about as much as the chart has itself.
+    # Cells that are half covered: their area is about that of the chart.
     half = rotated_masks(rim, RING, 4.0, 0.0, 0.5)[0][0]
     assert half.sum() == pytest.approx(16 * (63 - 15), rel=0.02)
 
 
-def test_places_are_free_and_none_is_found_in_a_full_square():
+def test_places_found_are_free_and_a_full_square_has_none():
     rim = outline_of(RING, RING_TRIANGLES)
     shapes = ChartMasks([(RING, rim)] * 4, 2.0, 0.0, 40)
     border, taken = shapes.border(40), 0
@@ -41,7 +41,7 @@ def test_places_are_free_and_none_is_found_in_a_full_square():
     assert shapes.find_place(0, (1 << 41 * 40) - 1, border, 40, 0.5) is None
 
 
-def test_a_chart_is_not_turned_onto_itself():
+def test_turns_that_map_a_chart_onto_itself_are_skipped():
     square, oblong = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 0], [3, 0], [3, 1], [0, 1.0]])
     wedge, triangles = np.array([[0, 0], [3, 0], [3, 1], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     shapes = ChartMasks([(uv, outline_of(uv, triangles)) for uv in (square, oblong, wedge)], 8.0, 1.5, 60)
@@ -52,12 +52,12 @@ def test_a_chart_is_not_turned_onto_itself():
     assert less == [shapes.find_place(i, taken, shapes.border(60), 60, 0.5) for i in range(2)]
 
 
-def test_what_charts_leave_free_of_each_other_is_what_is_not_taken():
+def test_places_blocked_by_charts_are_those_where_cells_are_taken():
     ring, sides = outline_of(RING, RING_TRIANGLES), np.random.default_rng(5).uniform(1, 9, (6, 2))
     square, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     boxed = [(RING, ring)] * 2 + [(square * side, outline_of(square * side, triangles)) for side in sides]
     shapes = ChartMasks(boxed, 2.0, 1.5, 44)
-    border, taken, others = shapes.border(40), 0, []  # a smaller square than they are made for
+    border, taken, others = shapes.border(40), 0, []  # a smaller square than the masks' side
     for i in range(8):
         place = shapes.find_place(i, taken, border, 40, 0.5)
         assert shapes.find_place(i, taken, border, 40, 0.5, others) == place is not None
@@ -101,21 +101,23 @@ def test_upright_is_the_smallest_rectangle_with_its_longer_side_along_u():
     assert np.ptp(orient_upright(RING @ turn), 0) == pytest.approx([9, 7], rel=1e-3)
 
 
-def test_no_orders_are_sought_for_a_grid_on_which_charts_do_not_come_apart(monkeypatch):
-    """They are where any part of a cell counts, and where even those layouts cannot be settled on whole cells."""
+def test_orders_are_not_searched_where_charts_cannot_be_separated(monkeypatch):
+    """Charts cannot be separated here: the first share of a cell is skipped, the other two are searched for orders."""
     from gdtool.unwrap.pack import search
 
     sides = np.random.default_rng(3).uniform(1, 5, (14, 2))
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     charts = [(np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]) * side, triangles) for side in sides]
-    sought, improved = [], search._improve_layouts
+    calls, improved = [], search._improve_layouts
     monkeypatch.setattr(
-        search, "_improve_layouts", lambda *given, **more: sought.append(given) or improved(*given, **more)
+        search,
+        "_improve_layouts",
+        lambda *arguments, **options: calls.append(arguments) or improved(*arguments, **options),
     )
-    monkeypatch.setattr(FineGridCompactor, "separate", lambda *given: None)
+    monkeypatch.setattr(FineGridCompactor, "separate", lambda *arguments: None)
     places, _ = search.pack(charts, 0.002)
-    shares = [given[0].shapes for given in sought]
-    assert len(sought) == 2
+    shares = [arguments[0].shapes for arguments in calls]
+    assert len(calls) == 2
     assert shares[0] != shares[1]
     assert (
         owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(14)]), 2048) <= 1

@@ -1,4 +1,4 @@
-"""Small charts and the neighbours that they lie flat with."""
+"""Small charts merge with the neighbours that they lie flat with."""
 
 import numpy as np
 import trimesh
@@ -13,7 +13,7 @@ GOOD = 1.002
 
 
 def sheet(n, height=0.0, bend=0.0, down=False):
-    """n x n quads over the unit square, bent about y with so much curvature."""
+    """Make n x n quads over the unit square, bent about y with curvature `bend`."""
     u, v = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
     turn = bend * (u - 0.5)
     x, z = (np.sin(turn) / bend, (1 - np.cos(turn)) / bend) if bend else (u, 0 * u)
@@ -39,7 +39,7 @@ def test_large_charts_stay_apart():
     assert (merge_small_charts(QuadMesh(vertices, faces), label, proxy_of(vertices, faces), GOOD) == label).all()
 
 
-def test_what_would_close_or_stretch_stays_apart():
+def test_charts_that_would_close_or_stretch_stay_apart():
     ball = trimesh.creation.icosphere(4)
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     height = ball.triangles_center[:, 2]
@@ -55,25 +55,25 @@ def test_what_would_close_or_stretch_stays_apart():
 
 
 def test_the_sides_of_a_thin_wall_keep_their_labels():
-    (one, up), (two, down) = sheet(30), sheet(30, height=0.002, down=True)
-    vertices, faces = np.concatenate([one, two]), np.concatenate([up, down + len(one)])
+    (front, up), (back, down) = sheet(30), sheet(30, height=0.002, down=True)
+    vertices, faces = np.concatenate([front, back]), np.concatenate([up, down + len(front)])
     label = np.repeat([0, 1], 900)
-    (one, up), (two, down) = sheet(7), sheet(7, height=0.002, down=True)
-    proxy = proxy_of(np.concatenate([one, two]), np.concatenate([up, down + len(one)]))
+    (front, up), (back, down) = sheet(7), sheet(7, height=0.002, down=True)
+    proxy = proxy_of(np.concatenate([front, back]), np.concatenate([up, down + len(front)]))
     corners = np.concatenate([proxy.faces, np.full((len(proxy.faces), 1), -1)], 1)
     adjacency = Adjacency(QuadMesh(proxy.vertices, corners))
     labels = _transfer_labels(QuadMesh(vertices, faces), label, proxy, adjacency)
     assert (labels == np.repeat([0, 1], 98)).all()
 
 
-def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch):
-    """A hemisphere and its cap, taken for one chart: together they stretch, apart each does what it can."""
+def test_charts_that_are_flat_together_only_on_the_proxy_are_split_again(monkeypatch):
+    """A hemisphere and its cap, merged into one chart: together they stretch too much, so each becomes a chart."""
     ball = trimesh.creation.icosphere(4)
     ball.update_faces(ball.triangles_center[:, 2] > 0)
     ball.remove_unreferenced_vertices()
     faces = np.concatenate([ball.faces, np.full((len(ball.faces), 1), -1)], 1)
     label = (ball.triangles_center[:, 2] > 0.985).astype(int)
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: np.zeros(len(faces), int))
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: np.zeros(len(faces), int))
     monkeypatch.setattr(schedule, "_MAX_TOTAL_EXCESS", np.inf)
     charts, _ = schedule.flatten_all(
         QuadMesh(ball.vertices, faces), label, schedule.FlattenLimits(GOOD, 1.5), TriMesh(ball.vertices, ball.faces)
@@ -86,12 +86,12 @@ def test_what_lay_flat_together_on_the_proxy_alone_comes_apart_again(monkeypatch
     assert ((owner == owner[label.argmax()]) == (label == 1)).all()
 
 
-def test_a_chart_that_touches_itself_in_a_vertex_has_it_twice():
+def test_a_vertex_in_which_a_chart_touches_itself_is_doubled():
     from gdtool.unwrap.segment.charts import chart_mesh
 
     vertices, faces = sheet(2)
-    for own, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
-        made = chart_mesh(QuadMesh(vertices, faces[own]))
+    for faces_idx, count in (([0, 1], 6), ([0, 3], 8), ([0, 1, 3], 8), ([0, 1, 2, 3], 9)):
+        made = chart_mesh(QuadMesh(vertices, faces[faces_idx]))
         points, corners = made.vertices, made.faces
         assert len(points) == count
-        np.testing.assert_array_equal(points[corners], vertices[faces[own]])
+        np.testing.assert_array_equal(points[corners], vertices[faces[faces_idx]])

@@ -1,4 +1,4 @@
-"""Charts that lie on themselves in places lose these places, and the charts around get them."""
+"""Charts that overlap themselves lose the overlapping faces, which neighbouring charts get."""
 
 import numpy as np
 import pytest
@@ -14,8 +14,10 @@ from tests.unwrap.test_merge import GOOD, sheet
 
 
 def spiral(turns, around=120, across=6):
-    """A band of quads that winds around, each turn as high above the last as it is wide: flat, it lies on itself past
-    one."""
+    """Make a spiral band of quads: vertices (v, 3), faces (f, 4), and flat coordinates (v, 2).
+
+    The flat coordinates overlap where there is more than one turn.
+    """
     angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi * turns, around + 1), np.linspace(0.5, 0.6, across + 1))
     uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
     row, column = (x.ravel() for x in np.mgrid[:across, :around])
@@ -24,17 +26,17 @@ def spiral(turns, around=120, across=6):
     return np.concatenate([uv, 0.01 * angle.ravel()[:, None]], 1), faces, uv
 
 
-def test_the_end_that_lies_on_the_beginning_is_taken_off():
+def test_only_the_overlapping_end_of_a_spiral_is_removed():
     vertices, faces, uv = spiral(1.05)
     triangles, face_idx = triangulated(faces)
     assert 0 < overlapping_triangles(uv, triangles).mean() < 0.2
     keep = remove_overlaps(Adjacency(QuadMesh(vertices, faces)), np.arange(len(faces)), triangles, face_idx, uv)
-    # One of the two ends, not both; the rest lies apart.
+    # One of the two ends is removed, not both; nothing overlaps any more.
     assert 0.9 < keep.mean() < 0.97
     assert not overlapping_triangles(uv, triangles[keep[face_idx]]).any()
 
 
-def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
+def test_a_disk_whose_rim_does_not_cross_itself_has_no_overlap():
     for turns in (0.9, 1.05, 1.6):
         _, faces, uv = spiral(turns)
         triangles = triangulated(faces)[0].astype(np.int64)
@@ -46,9 +48,8 @@ def test_a_disk_whose_rim_does_not_cross_itself_lies_on_nothing():
 
 
 @pytest.mark.parametrize("past", [0.0, 20.0])
-def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
-    """A fan around a corner of the rim, once around; and with an end past either side of where it meets itself, all in
-    one place."""
+def test_a_rim_may_cross_itself_where_two_of_its_corners_coincide(past):
+    """A fan of triangles all around a corner, whose two ends meet in one place or run past each other."""
     degrees, length = np.array([-past, *range(0, 361, 30), 360 + past]), np.array([0.6, *[1.0] * 13, 0.6])
     uv = np.concatenate(
         [[[0, 0]], length[:, None] * np.stack([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))], -1)]
@@ -61,13 +62,13 @@ def test_a_rim_that_crosses_itself_where_two_of_its_corners_coincide(past):
     assert overlaps_itself(uv, triangles, edges_of(triangles), True) == bool(past)
 
 
-def test_what_lies_on_itself_by_half_is_not_peeled():
+def test_overlaps_of_half_a_chart_are_not_removed():
     vertices, faces, uv = spiral(1.6)
     triangles, face_idx = triangulated(faces)
     assert remove_overlaps(Adjacency(QuadMesh(vertices, faces)), np.arange(len(faces)), triangles, face_idx, uv) is None
 
 
-def test_a_peeled_band_is_two_charts_and_not_many_halves():
+def test_an_overlapping_band_becomes_two_charts():
     vertices, faces, _ = spiral(1.05)
     charts, cut = schedule.flatten_all(
         QuadMesh(vertices, faces),
@@ -82,8 +83,8 @@ def test_a_peeled_band_is_two_charts_and_not_many_halves():
         assert not overlapping_triangles(uv, triangles).any()
 
 
-def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
-    """Beside a dome, along a seam as long, lies the sheet that the piece continues."""
+def test_a_piece_is_added_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
+    """The piece has seams of equal length with a dome and with the sheet that it continues."""
     vertices, faces = sheet(12)
     column = np.arange(144) % 12
     bulge = np.clip(4 - (vertices[:, 0] * 12), 0, None)
@@ -98,8 +99,8 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
             TriMesh(vertices, triangulated(faces[faces_idx])[0].astype(np.int64)),
         )[0][0]
 
-    def left(home, beside=(dome, flat), good=GOOD):
-        charts = [chart(own)._replace(faces_idx=own) for own in beside]
+    def unplaced(home, beside=(dome, flat), good=GOOD):
+        charts = [chart(faces_of_chart)._replace(faces_idx=faces_of_chart) for faces_of_chart in beside]
         return len(
             give_to_neighbours(
                 Adjacency(QuadMesh(vertices, faces)),
@@ -110,29 +111,29 @@ def test_a_piece_goes_to_the_neighbour_that_it_lies_flat_with(monkeypatch):
             )
         ), charts
 
-    count, charts = left(piece)
+    count, charts = unplaced(piece)
     assert not count
     assert len(charts[0][0]) == len(dome)
     assert sorted(charts[1][0]) == sorted(np.concatenate([flat, piece]))
-    # What it came off does not get it back; with nothing flat beside it, it is left; so are all once enough has been
-    # tried.
-    assert left(flat, [flat])[0] == 1
-    assert left(dome, [flat])[0] == 0
-    assert left(piece, [dome], 1 + 1e-9)[0] == 1
+    # The piece is not placed if its only flat neighbour is the chart it was removed from, if no neighbour lies flat
+    # with it, or once the limit of work is reached.
+    assert unplaced(flat, [flat])[0] == 1
+    assert unplaced(dome, [flat])[0] == 0
+    assert unplaced(piece, [dome], 1 + 1e-9)[0] == 1
     monkeypatch.setattr("gdtool.unwrap.segment.overlaps._MAX_WORK", -1)
-    assert left(piece)[0] == 1
+    assert unplaced(piece)[0] == 1
 
 
 @pytest.mark.parametrize(("columns", "stays"), [(1, True), (4, False)])
-def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
+def test_a_chart_much_larger_than_a_piece_keeps_its_coordinates(columns, stays):
     vertices, faces = sheet(12, bend=1.0)
     column = np.arange(144) % 12
-    piece, own = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
-    made = chart_mesh(QuadMesh(vertices, faces[own]))
+    piece, others = np.flatnonzero(column < columns), np.flatnonzero(column >= columns)
+    made = chart_mesh(QuadMesh(vertices, faces[others]))
     points, corners = made.vertices, made.faces
-    # Bent and slanted: laid anew it would not come to lie so.
-    lies = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
-    charts = [Chart(own, corners, lies, triangulated(corners)[0])]
+    # Slanted coordinates, which flattening again would not reproduce.
+    flat_uv = np.stack([np.arcsin(points[:, 0]), points[:, 1] + 0.01 * points[:, 0]], -1)
+    charts = [Chart(others, corners, flat_uv, triangulated(corners)[0])]
     assert not give_to_neighbours(
         Adjacency(QuadMesh(vertices, faces)),
         QuadMesh(vertices, faces),
@@ -143,5 +144,5 @@ def test_a_chart_much_larger_than_a_piece_stays_as_it_lies(columns, stays):
     faces_idx, corners, uv, triangles = charts[0]
     assert sorted(faces_idx) == list(range(144))
     assert not overlapping_triangles(uv, triangles).any()
-    assert (uv[: len(lies)] == lies).all() == stays
+    assert (uv[: len(flat_uv)] == flat_uv).all() == stays
     assert stretch(TriMesh(chart_mesh(QuadMesh(vertices, faces[faces_idx])).vertices, triangles), uv) < 1.02

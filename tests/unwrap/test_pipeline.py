@@ -1,4 +1,4 @@
-"""Unwrap: quads stay whole, nothing overlaps, nothing is mirrored, and a dead child is survived."""
+"""Unwrapping: quads stay whole, nothing overlaps, nothing is mirrored, and a dead child is survived."""
 
 import time
 
@@ -26,7 +26,7 @@ SMALL = pipeline.Request(size=512, padding=4)
 
 
 def box(n: int = 6):
-    """A cube of side 1 with n x n quads a side."""
+    """Make a cube of side 1 with at least n x n quads a side."""
     from gdtool.remesh.fit.surface_projection import subdivide
 
     vertices, quads = cube()[0], CUBE_QUADS
@@ -37,7 +37,7 @@ def box(n: int = 6):
 
 
 def checked(vertices, faces, result, size=512):
-    """The figures, after what must always hold."""
+    """Check what must hold for all results, and return the figures."""
     assert np.isfinite(result.uv).all()
     assert result.uv.min() >= 0
     assert result.uv.max() <= 1
@@ -60,14 +60,14 @@ def test_box_unfolds_without_stretch():
     assert figures["seam_length"] <= 12 / 3**0.5 + 1e-6
 
 
-def test_torus_has_even_density_and_gap():
+def test_torus_has_uniform_density_and_gaps():
     vertices, faces, _ = torus(48, 24)
     result = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
     figures = checked(vertices, faces, result)
     assert figures["stretch"] < 1.1
     assert figures["area_distortion"] < 1.3
     assert figures["charts"] <= 16
-    # Charts stay 4 texels of 512 apart: growing each by a texel and a half makes none meet.
+    # Charts stay 4 texels of 512 apart, so they do not meet when each is grown by a texel.
     from scipy.ndimage import binary_dilation
 
     from gdtool.geometry.topology import triangulated
@@ -82,10 +82,10 @@ def test_torus_has_even_density_and_gap():
 
 
 def test_two_pieces_and_triangles_mixed():
-    one, quads = box(2)
-    two, triangles = cube(0.3)
-    vertices = np.concatenate([one, two + 2])
-    faces = np.concatenate([quads, np.concatenate([triangles + len(one), np.full((12, 1), -1)], 1)])
+    large, quads = box(2)
+    small, triangles = cube(0.3)
+    vertices = np.concatenate([large, small + 2])
+    faces = np.concatenate([quads, np.concatenate([triangles + len(large), np.full((12, 1), -1)], 1)])
     checked(vertices, faces, pipeline.unwrap(QuadMesh(vertices, faces), SMALL))
 
 
@@ -120,7 +120,7 @@ def test_dead_xatlas_leaves_box_projection(monkeypatch):
 
 
 @pytest.mark.parametrize("seconds", [1e-3, 0.3])
-def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
+def test_with_hardly_any_time_the_atlas_is_simple_and_valid(seconds):
     vertices, faces, _ = torus(96, 48)
     start = time.monotonic()
     result = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=512, padding=4, seconds=seconds))
@@ -129,7 +129,7 @@ def test_with_hardly_any_time_the_atlas_is_plain_and_valid(seconds):
     checked(vertices, faces, result)
 
 
-def test_what_is_left_when_the_time_is_over_goes_face_by_face():
+def test_remaining_faces_become_charts_when_the_time_is_over():
     vertices, faces, _ = torus(24, 12)
     charts, why = flatten_all(QuadMesh(vertices, faces), np.zeros(len(faces), int), FlattenLimits(1.002, 1.1, 0.0, 0.0))
     assert len(charts) == len(faces)
@@ -138,7 +138,7 @@ def test_what_is_left_when_the_time_is_over_goes_face_by_face():
     assert checked(vertices, faces, result)["charts"] == len(faces)
 
 
-def test_what_the_conformal_map_refuses_starts_from_a_circle(monkeypatch):
+def test_a_failed_conformal_map_is_replaced_by_tuttes_embedding(monkeypatch):
     def refuses(*_):
         raise RuntimeError("igl::lscm failed")
 
@@ -154,7 +154,7 @@ def test_what_the_conformal_map_refuses_starts_from_a_circle(monkeypatch):
 
 
 def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
-    """Skipped, and nothing worth its seams is lost: with every cut tried the square is filled no better by a tenth."""
+    """Cutting is skipped, and little is lost: with every cut tried, coverage is less than a tenth better."""
     side = np.arange(9)
     x, y = np.meshgrid(side, side)
     plate = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], -1) / 8.0
@@ -163,16 +163,16 @@ def test_charts_stay_whole_where_they_fill_the_square(monkeypatch):
     ell = quads[(plate[quads].mean(1)[:, :2] < 0.25).any(1)]
     meshes = [(plate, quads)] * 8 + [(plate, ell)]
     vertices = np.concatenate([points + [0, 0, height] for height, (points, _) in enumerate(meshes)])
-    faces = np.concatenate([own + 81 * k for k, (_, own) in enumerate(meshes)])
-    found = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
-    assert [what for what, _, _ in found.skipped] == ["cutting further for packing"]
-    assert found.skipped[0][2] > 0
+    faces = np.concatenate([quads_of_plate + 81 * k for k, (_, quads_of_plate) in enumerate(meshes)])
+    uncut = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
+    assert [what for what, _, _ in uncut.skipped] == ["cutting further for packing"]
+    assert uncut.skipped[0][2] > 0
     monkeypatch.setattr(pipeline, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "WELL_PACKED", 1.0)
     monkeypatch.setattr(search, "_MAX_STEP_GAIN", 1.0)
-    other = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
-    few, many = checked(vertices, faces, found), checked(vertices, faces, other)
-    assert not other.skipped
+    cut = pipeline.unwrap(QuadMesh(vertices, faces), SMALL)
+    few, many = checked(vertices, faces, uncut), checked(vertices, faces, cut)
+    assert not cut.skipped
     assert many["coverage"] < 1.1 * few["coverage"]
     assert many["stretch"] == pytest.approx(few["stretch"], abs=1e-3)
 
@@ -191,7 +191,7 @@ def test_cylinder_side_is_developable():
 def test_stretch_of_known_maps():
     vertices, triangles = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]])
     assert stretch(TriMesh(vertices, triangles), 7 * vertices[:, :2]) == pytest.approx(1)
-    # Stretched by two one way: sqrt((a + 1/a) / 2) with a = 2.
+    # Stretched by two in one direction: sqrt((a + 1/a) / 2) with a = 2.
     assert stretch(TriMesh(vertices, triangles), vertices[:, :2] * [2, 1]) == pytest.approx((2.5 / 2) ** 0.5)
 
 
@@ -213,7 +213,7 @@ def test_a_torus_with_holes_has_a_handle_and_a_bent_sheet_with_holes_lies_flat(h
     assert stretch(TriMesh(vertices, triangles), flat.uv) < 1.001
 
 
-def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
+def test_four_rotated_squares_are_set_upright_and_packed_tight():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])
     assert np.ptp(orient_upright(square @ turn), 0) == pytest.approx([1, 1], abs=1e-3)
@@ -222,14 +222,14 @@ def test_four_squares_pack_tight_and_turned_ones_are_set_upright():
     for uv in places:
         assert uv.min() >= 0
         assert uv.max() <= 1
-        assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # turned, never mirrored
+        assert np.linalg.det([uv[1] - uv[0], uv[3] - uv[0]]) > 0  # rotated, never mirrored
         assert np.linalg.norm(uv[1] - uv[0]) == pytest.approx(scale)
     assert 4 * scale**2 > 0.8
     assert (owner_count(np.concatenate(places), np.concatenate([triangles + 4 * i for i in range(4)]), 512) <= 1).all()
 
 
-def test_the_tips_of_slivers_stay_clear_of_the_others():
-    """Where a triangle is narrower than the packer's cells it takes its place all the same."""
+def test_slivers_do_not_overlap_other_charts():
+    """Triangles narrower than the packer's cells still get their place."""
     shapes = [np.array([[0, 0], [1, 0], [1, height]]) for height in (1.0, 0.055, 0.012)] + [
         np.array([[0, 0], [2.2, 0], [2.2, 0.055]])
     ]
@@ -238,14 +238,14 @@ def test_the_tips_of_slivers_stay_clear_of_the_others():
     assert (owner_count(np.concatenate(places), np.arange(3 * len(charts)).reshape(-1, 3), 4096) <= 1).all()
 
 
-def test_thousands_of_charts_go_on_shelves():
+def test_thousands_of_charts_are_placed_in_rows():
     triangle, faces = np.array([[0, 0], [1, 0], [0, 1.0]]), np.array([[0, 1, 2]])
     places, _ = pack([(triangle, faces)] * 2000, 0.002)
     assert min(uv.min() for uv in places) >= 0
     assert max(uv.max() for uv in places) <= 1
 
 
-def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
+def test_hundreds_of_charts_fill_the_square_better_than_rows_do():
     """Triangles of all sizes, whose bounding rectangles are half empty."""
     from gdtool.unwrap.pack.search import _shelf_pack
 
@@ -261,14 +261,14 @@ def test_hundreds_of_charts_fill_the_square_better_than_shelves_do():
     assert scale**2 > 1.2 * _shelf_pack([orient_upright(uv) for uv, _ in charts], 1 / 512)[1] ** 2
 
 
-def test_a_rim_that_crosses_by_a_hair_is_found():
+def test_a_rim_that_hardly_crosses_itself_is_found():
     from gdtool.unwrap.parameterize.flatten import overlapping_triangles, rim_crossings
 
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     ends = np.array([[0, 1], [1, 2], [2, 3], [3, 0]])
     assert not len(rim_crossings(square, ends)[0])
     assert rim_crossings(square[[0, 2, 1, 3]], ends)[0].tolist() == [0, 2]
-    # A strip of upright triangles bent almost into a ring: its ends pass each other by a millionth.
+    # A strip of triangles bent into a ring, whose ends miss or pass each other by a millionth.
     for turn, crosses in ((2 * np.pi - 1e-6, False), (2 * np.pi + 1e-6, True)):
         angle = np.repeat(np.linspace(0, turn, 65), 2)
         radius = np.tile([1.0, 2.0], 65)
@@ -279,7 +279,7 @@ def test_a_rim_that_crosses_by_a_hair_is_found():
 
 
 def ring_of_quads(around=96, across=10):
-    """A flat ring, inner radius half the outer: vertices, quads, and the chart that it is."""
+    """Make a flat ring, inner radius half the outer: vertices, quads, and the uv of its chart."""
     angle, radius = np.meshgrid(np.linspace(0, 2 * np.pi, around, endpoint=False), np.linspace(0.25, 0.5, across + 1))
     uv = np.stack([(radius * np.cos(angle)).ravel(), (radius * np.sin(angle)).ravel()], -1)
     row, column = (x.ravel() for x in np.mgrid[:across, :around])
@@ -302,8 +302,8 @@ def test_a_ring_is_cut_into_arcs_that_keep_their_coordinates():
     few, parts = cut_to_pack(adjacency, [chart], [2, 40])
     assert 2 <= len(few) <= 3 < len(parts)
     assert sorted(np.concatenate([part[0] for part in parts])) == list(range(len(quads)))
-    for faces_idx, corners, own, _ in parts:
-        np.testing.assert_array_equal(own[corners], uv[quads[faces_idx]])
+    for faces_idx, corners, part_uv, _ in parts:
+        np.testing.assert_array_equal(part_uv[corners], uv[quads[faces_idx]])
     # A filled square is not cut.
     square = np.stack(np.meshgrid(np.linspace(0, 1, 11), np.linspace(0, 1, 11)), -1).reshape(-1, 2)
     i = (np.arange(10)[:, None] * 11 + np.arange(10)).ravel()
@@ -320,13 +320,13 @@ def test_two_rings_fill_the_square_better_once_cut():
     vertices, quads, _ = ring_of_quads()
     both = np.concatenate([vertices, vertices + (2, 0, 0)])
     faces = np.concatenate([quads, quads + len(vertices)])
-    found = checked(both, faces, pipeline.unwrap(QuadMesh(both, faces), SMALL))
+    figures = checked(both, faces, pipeline.unwrap(QuadMesh(both, faces), SMALL))
     # Two whole rings cannot cover more than 2 * 0.75 pi / 4 of the square around the two of them, which is 1.707 of
     # their width.
-    assert found["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
+    assert figures["coverage"] > 0.45 > 2 * 0.75 * np.pi / 4 / 1.707**2
 
 
-def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
+def test_sets_of_more_charts_are_not_tried_where_few_fill_the_square():
     from gdtool.unwrap.pack.search import WELL_PACKED, choose_cut
 
     def grid(n, sides):
@@ -337,9 +337,9 @@ def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
     chosen, share, *_ = choose_cut([few, many], 1 / 512)
     assert chosen == 0
     assert share > WELL_PACKED
-    # Where the first fills it badly, those that fill it are taken.
+    # Where the first set fills it badly, a later one that fills it is taken.
     assert choose_cut([narrow, many], 1 / 512)[0] == 1
-    # Where it fills much less, the next ones are leapt over, though never the last.
+    # Where a set fills much less, the next ones are skipped, but never the last.
     strips = grid(2, (3.0, 0.3))
     assert choose_cut([strips, few, many], 1 / 512)[::3] == (2, 1)
     assert choose_cut([strips, many], 1 / 512)[::3] == (
@@ -349,18 +349,18 @@ def test_orders_are_not_searched_for_more_charts_where_few_fill_the_square():
 
 
 @pytest.mark.parametrize(("around", "across", "minor"), [(96, 20, 0.08), (80, 28, 0.12), (96, 12, 0.035)])
-def test_ways_leapt_over_cost_no_coverage_and_a_seam_or_two(monkeypatch, around, across, minor):
-    """The tolerance of that skip: .02 of the square and eight charts, against every way to cut being packed."""
+def test_skipped_sets_of_charts_cost_little_coverage_and_few_seams(monkeypatch, around, across, minor):
+    """Against packing every set of charts, skipping some costs at most 0.02 of the square and eight charts."""
     vertices, faces, _ = torus(around, across, 0.35, minor)
-    found = []
+    measured = []
     for gains in (search._MAX_STEP_GAIN, np.inf):
         monkeypatch.setattr(search, "_MAX_STEP_GAIN", gains)
-        laid = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=1024, padding=4))
-        leapt = [why for what, why, _ in laid.skipped if what.startswith("packing")]
-        assert len(leapt) == (gains < np.inf)
-        assert not laid.failed
-        found.append(pipeline.figures(QuadMesh(vertices, faces, laid.uv, laid.face_uvs)))
-    quick, whole = found
+        result = pipeline.unwrap(QuadMesh(vertices, faces), pipeline.Request(size=1024, padding=4))
+        reasons = [why for what, why, _ in result.skipped if what.startswith("packing")]
+        assert len(reasons) == (gains < np.inf)
+        assert not result.failed
+        measured.append(pipeline.figures(QuadMesh(vertices, faces, result.uv, result.face_uvs)))
+    quick, whole = measured
     assert quick["coverage"] > whole["coverage"] - 0.02
     assert quick["charts"] <= whole["charts"] + 8
     assert quick["overlap"] == 0

@@ -16,10 +16,11 @@ def ball(level=4):
 
 
 def whole_stretch(vertices, faces, charts):
+    """Compute the L2 stretch of all charts together."""
     points, corners, uvs, offset = [], [], [], 0
-    for faces_idx, own, uv, triangles in charts:
+    for faces_idx, chart_corners, uv, triangles in charts:
         place = np.zeros((len(uv), 3))
-        place[own[own >= 0]] = vertices[faces[faces_idx][own >= 0]]
+        place[chart_corners[chart_corners >= 0]] = vertices[faces[faces_idx][chart_corners >= 0]]
         points.append(place)
         corners.append(triangles + offset)
         uvs.append(uv)
@@ -27,11 +28,11 @@ def whole_stretch(vertices, faces, charts):
     return stretch(TriMesh(np.concatenate(points), np.concatenate(corners).astype(np.int64)), np.concatenate(uvs))
 
 
-def test_charts_that_stretch_most_are_cut_until_the_whole_stretches_little(monkeypatch):
+def test_the_most_stretched_charts_are_cut_until_all_together_stretch_little(monkeypatch):
     vertices, faces, centre = ball()
     label = (centre[:, 2] > 0).astype(int)
     proxy = TriMesh(vertices, faces[:, :3])
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: label)
     charts, why = schedule.flatten_all(QuadMesh(vertices, faces), label, schedule.FlattenLimits(1.01, 1.5), proxy)
     assert 1.002 < whole_stretch(vertices, faces, charts) < 1.014
     assert 3 <= len(charts) <= 8
@@ -53,12 +54,12 @@ def test_charts_that_stretch_little_stay_whole():
     assert not any("more than most" in line for line in result.failed)
 
 
-def test_what_cannot_be_relieved_ends(monkeypatch):
-    """Faces without area, and folds in which every cut stretches again: the number of cuts is bounded."""
+def test_cutting_ends_where_stretch_cannot_be_reduced(monkeypatch):
+    """Faces without area, and folds that stretch again after every cut: the number of cuts is bounded."""
     vertices, faces, centre = ball(3)
     crumpled = vertices * (1 + 0.5 * np.random.default_rng(0).random((len(vertices), 1)))
     label = (centre[:, 2] > 0).astype(int)
-    monkeypatch.setattr(schedule, "merge_small_charts", lambda *given: label)
+    monkeypatch.setattr(schedule, "merge_small_charts", lambda *arguments: label)
     charts, why = schedule.flatten_all(
         QuadMesh(crumpled, faces), label, schedule.FlattenLimits(1.0000001, 1.1), TriMesh(crumpled, faces[:, :3])
     )
@@ -68,7 +69,7 @@ def test_what_cannot_be_relieved_ends(monkeypatch):
     assert sorted(np.concatenate([chart[0] for chart in charts])) == list(range(len(faces)))
 
 
-def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
+def test_a_chart_is_cut_between_its_parts_or_else_through_the_middle():
     from gdtool.unwrap.segment.charts import Adjacency
     from tests.unwrap.test_merge import sheet
 
@@ -76,7 +77,7 @@ def test_a_chart_is_cut_between_its_parts_and_without_any_through_the_middle():
     vertices = vertices * [2, 1, 1]
     adjacency, column = Adjacency(QuadMesh(vertices, faces)), np.arange(400) % 20
     for part, first in ((column >= 6, 6), (np.where(column < 12, 7, np.where(column < 15, 3, 5)), 12)):
-        one, other = schedule._split_set(adjacency, part, np.arange(400))
-        assert {len(one), len(other)} == {20 * first, 400 - 20 * first}
-        assert (column[one] < first).all() != (column[other] < first).all()
+        first_set, second_set = schedule._split_set(adjacency, part, np.arange(400))
+        assert {len(first_set), len(second_set)} == {20 * first, 400 - 20 * first}
+        assert (column[first_set] < first).all() != (column[second_set] < first).all()
     assert min(map(len, schedule._split_set(adjacency, np.zeros(400, int), np.arange(400)))) > 150

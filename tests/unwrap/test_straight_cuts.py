@@ -1,4 +1,4 @@
-"""Where flat charts are cut for packing: first where their rectangles lose most, and past crumbs along a rough rim."""
+"""Flat charts are cut for packing: first where rectangles save most area, and past small parts along a rough rim."""
 
 import numpy as np
 
@@ -10,25 +10,26 @@ from gdtool.unwrap.segment.straight_cuts import cut_to_pack
 
 
 def plates(*cells):
-    """Vertices, quads and a flat chart for each of some masks (h, w) of unit cells, one above the other."""
+    """Make plates of unit cells, one above the other, from masks (h, w); return their adjacency and flat charts."""
     points, quads, charts, vertices, faces = [], [], [], 0, 0
     for height, mask in enumerate(cells):
         h, w = mask.shape
         x, y = np.meshgrid(np.arange(w + 1.0), np.arange(h + 1.0))
         row, column = np.nonzero(mask)
         corner = row * (w + 1) + column
-        own = np.stack([corner, corner + 1, corner + w + 2, corner + w + 1], -1)
+        corners = np.stack([corner, corner + 1, corner + w + 2, corner + w + 1], -1)
         uv = np.stack([x.ravel(), y.ravel()], -1)
-        used, local = np.unique(own, return_inverse=True)
+        used, local = np.unique(corners, return_inverse=True)
         local = local.reshape(-1, 4)
-        charts.append(Chart(faces + np.arange(len(own)), local, uv[used], triangulated(local)[0]))
+        charts.append(Chart(faces + np.arange(len(corners)), local, uv[used], triangulated(local)[0]))
         points.append(np.concatenate([uv, np.full((len(uv), 1), float(height))], 1))
-        quads.append(own + vertices)
-        vertices, faces = vertices + len(uv), faces + len(own)
+        quads.append(corners + vertices)
+        vertices, faces = vertices + len(uv), faces + len(corners)
     return Adjacency(QuadMesh(np.concatenate(points), np.concatenate(quads))), charts
 
 
 def ell(size, arm):
+    """Make the mask of an L in a square of `size` cells, with arms `arm` cells wide."""
     mask = np.zeros((size, size), bool)
     mask[:arm], mask[:, :arm] = True, True
     return mask
@@ -41,11 +42,11 @@ def test_the_chart_whose_rectangle_is_emptiest_is_cut_first():
     assert len(first) == 4
     assert {ell(10, 4).sum(), 144} <= set(sizes)
     parts = [chart for chart in first if len(chart[0]) not in (ell(10, 4).sum(), 144)]
-    # The two arms of the large one: their rectangles are full.
+    # The two arms of the large L: they fill their rectangles.
     assert all(np.prod(np.ptp(chart[2], 0)) < 1.2 * len(chart[0]) for chart in parts)
 
 
-def test_crumbs_along_a_rough_rim_do_not_forbid_a_cut():
+def test_small_parts_along_a_rough_rim_do_not_prevent_a_cut():
     """An L whose inner rims are combs: a line along them cuts off each tooth."""
     mask = ell(40, 8)
     mask[8, 9::2], mask[9::2, 8] = True, True

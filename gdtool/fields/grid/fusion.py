@@ -94,14 +94,13 @@ class FusionOptions:
 class Shape:
     """Hold a closed mesh that faces outward, and how it came about.
 
-    vertices (v, 3) float64, faces (f, 3) int32. support (v,): weight of the views that measured each vertex. step: of
-    the grid, world units. dropped: pieces removed as debris. bumps: degrees between the surface's normals and those of
-    views that disagree, None where not needed. restored: share of the picture's mask behind which the fused views left
-    nothing.
+    mesh: vertices (v, 3) float64, faces (f, 3) int32. support (v,): weight of the views that measured each vertex.
+    step: of the grid, world units. dropped: pieces removed as debris. bumps: degrees between the surface's normals and
+    those of views that disagree, None where not needed. restored: share of the picture's mask behind which the fused
+    views left nothing.
     """
 
-    vertices: np.ndarray
-    faces: np.ndarray
+    mesh: TriMesh
     support: np.ndarray
     step: float
     dropped: int
@@ -257,7 +256,7 @@ def fuse_views(views: list[PreparedView], step: float, options: FusionOptions = 
     if bumps is not None and bumps > BUMPY_DEGREES:
         mesh = TriMesh(fit_to_normals(mesh, views, step, reach=reach + noise), mesh.faces)
     support = measured_planes(views, mesh.vertices, vertex_normals(mesh), reach)[2]
-    return Shape(mesh.vertices, mesh.faces, support, step, dropped, bumps, restored)
+    return Shape(mesh, support, step, dropped, bumps, restored)
 
 
 def _smoothed(values: np.ndarray, noise: float) -> np.ndarray:

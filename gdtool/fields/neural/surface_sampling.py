@@ -49,13 +49,16 @@ def first_crossing(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def secant_root(t0: Tensor, t1: Tensor, f0: Tensor, f1: Tensor) -> Tensor:
-    """Where the chord from (t0, f0 >= 0) to (t1, f1 < 0) is zero."""
+    """Find where the chord from (t0, f0 >= 0) to (t1, f1 < 0) is zero."""
     gap = (f0 - f1).clamp_min(torch.finfo(f0.dtype).tiny)
     return t0 + (t1 - t0) * (f0 / gap).clamp(0.0, 1.0)
 
 
 def median_of_cdf(t: Tensor, values: Tensor, sharpness: Tensor | float) -> Tensor:
-    """The paper's surface point: where the NeuS weights of samples t (r, d), values (r, d), pass half their sum."""
+    """Find the paper's surface point (r,) on each ray: where the sum of its NeuS weights passes half its total.
+
+    t (r, d): the samples' distances along the rays; values (r, d): signed distances there.
+    """
     weights = neus_weights(values, sharpness)
     total = weights.sum(1, keepdim=True).clamp_min(torch.finfo(t.dtype).tiny)
     cdf = torch.cumsum(weights / total, 1)

@@ -1,4 +1,4 @@
-"""Collapse folded quads that no movement of their corners untangles: two opposite corners become one."""
+"""Collapse folded quads that moving vertices cannot untangle: two opposite corners become one vertex."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ _MAX_FOLDED = 200  # more folded quads have another cause than single bad quads
 
 
 class _Collapse(NamedTuple):
-    """A possible collapse: the worst scaled Jacobian after it, the corners kept and lost, the position of the kept one,
-    and the faces that no other collapse may touch.
+    """A possible collapse of one quad, and the worst scaled Jacobian that it leaves.
+
+    It names the corner kept and the corner lost, the position of the kept one, and the faces around the quad. No other
+    collapse of the same round may touch these faces.
     """
 
     quality: float
@@ -32,11 +34,11 @@ class _Collapse(NamedTuple):
 def collapse_folded_quads(
     mesh: QuadMesh, surface: ProjectionTarget, constraints: Constraints
 ) -> tuple[QuadMesh, Constraints]:
-    """Collapse folded quads along a diagonal (Daniels et al. 2008) where that improves the quads around much.
+    """Collapse folded quads along a diagonal (Daniels et al. 2008) where that clearly improves the quads around.
 
-    The lost corner is on no feature. The kept one moves to where the worst of the quads around them comes out best. The
-    result is closed and manifold as before, with as many handles and pieces, without new vertices of two edges;
-    boundaries stay as they are.
+    The lost corner is on no feature. The kept corner moves to the position at which the worst quad around has the best
+    scaled Jacobian. The result is closed and manifold where the mesh was, with as many handles and pieces, and without
+    new vertices of two edges. Boundaries stay as they are.
     """
     vertices, faces = mesh.vertices, mesh.faces
     quality = scaled_jacobian(mesh)
@@ -69,15 +71,15 @@ def collapse_folded_quads(
                 or len(np.intersect1d(face_lists[keep], face_lists[lose])) > 1
             ):
                 continue
-            rest = faces[around[around != quad]]
-            moves = (rest == keep) | (rest == lose)
+            other_faces = faces[around[around != quad]]
+            moves = (other_faces == keep) | (other_faces == lose)
             positions = out[[keep]]
             if free[keep]:
                 positions = np.concatenate(
                     [positions, out[[lose]], surface.closest(out[[keep, lose]].mean(0, keepdims=True))[2]]
                 )
             for position in positions:
-                corners = np.where(moves[..., None], position, out[rest]).reshape(-1, 3)
+                corners = np.where(moves[..., None], position, out[other_faces]).reshape(-1, 3)
                 worst = scaled_jacobian(QuadMesh(corners, np.arange(len(corners)).reshape(-1, 4))).min()
                 if worst > (best.quality if best else quality[around].min() + _MIN_GAIN):
                     all_touched = np.concatenate([around, face_lists[side], face_lists[other]])

@@ -17,9 +17,10 @@ _FLAT_COSINE = 0.8  # least cosine between the normals of two quads whose edge m
 def cancel_pairs(mesh: QuadMesh) -> np.ndarray:
     """Cancel pairs of irregular vertices by rotating edges; return the new faces (q, 4).
 
-    mesh: a manifold of quads. Rotating an edge moves such a pair on and leaves regular quads behind (Peng et al. 2011,
-    Connectivity editing for quadrilateral meshes). Each pair is moved both ways until a rotation beside it leaves fewer
-    irregular vertices; otherwise it is put back. Faces that are not consistently oriented are returned as they are.
+    mesh: a manifold of quads. Rotating an edge moves such a pair by an edge and leaves regular quads behind (Peng et
+    al. 2011, Connectivity editing for quadrilateral meshes). Each pair is moved in each direction until a rotation
+    beside it leaves fewer irregular vertices; if none does, the pair is put back. Faces that are not consistently
+    oriented are returned unchanged.
     """
     vertices, faces = mesh.vertices, mesh.faces
     valence, inner = valences(faces, len(vertices))
@@ -37,9 +38,10 @@ def cancel_pairs(mesh: QuadMesh) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Rotation:
-    """The edge `old` between two faces is replaced by the edge `new` between two other corners of their hexagon.
+    """A rotation of the edge between two faces within the hexagon that they form.
 
-    before and after: the corners of the two faces.
+    The edge `old` is replaced by the edge `new` between two other corners of the hexagon. before, after: the corners of
+    the two faces.
     """
 
     old: tuple[int, int]
@@ -66,14 +68,14 @@ class _RotatableMesh:
         self._face_of: dict[tuple[int, int], int] = {}  # the face that traverses an edge in this direction
         self._face_at = [0] * len(valence)  # one of the faces around each vertex
         for k in range(len(self.faces)):
-            self._enter(k)
+            self._register(k)
 
     def is_oriented(self) -> bool:
-        """Whether no two faces traverse an edge in the same direction."""
+        """Return whether no two faces traverse an edge in the same direction."""
         return len(self._face_of) == 4 * len(self.faces)
 
     def apply_gains(self, *vertices: int) -> bool:
-        """Apply rotations at the vertices while any leaves fewer irregular vertices; return whether any did."""
+        """Apply rotations around `vertices` while any leaves fewer irregular vertices; return whether any did."""
         any_applied = False
         while rotation := next(
             (
@@ -89,9 +91,10 @@ class _RotatableMesh:
         return any_applied
 
     def move_pair(self, vertex: int, direction: int, steps: int) -> bool | None:
-        """Move the pair at a vertex in one of its directions until it cancels with others.
+        """Move the irregular pair at a vertex in one of its directions until it cancels with others.
 
-        Returns True where it did, False where it was put back, and None where there is no such direction.
+        direction: index among the possible first rotations. steps: the most rotations. Returns True where the pair
+        cancelled, False where it was put back, and None where there is no such direction.
         """
         path: list[_Rotation] = []
         for _ in range(steps):
@@ -115,14 +118,14 @@ class _RotatableMesh:
         return False
 
     def _neutral_rotations(self, vertex: int) -> Iterator[_Rotation]:
-        """Yield rotations that move an edge to a vertex of three and leave as many irregular vertices."""
+        """Yield rotations that add an edge to a vertex of three and leave the number of irregular vertices the same."""
         for other in self._neighbours(vertex):
             yield from self._rotations(vertex, other, neutral=True)
 
     def _rotations(self, p: int, q: int, neutral: bool = False) -> Iterator[_Rotation]:
-        """Yield the rotations of an edge that keep the quads a manifold without vertices of two edges.
+        """Yield the rotations of the edge (p, q) that keep the quads a manifold without vertices of two edges.
 
-        Only rotations that leave fewer irregular vertices; if neutral, those that leave as many and add an edge to a
+        Only those that leave fewer irregular vertices; with `neutral`, those that leave as many and add an edge to a
         vertex of three.
         """
         valence, inner = self.valence, self._inner
@@ -132,7 +135,7 @@ class _RotatableMesh:
         if not fewer and not neutral:
             return  # the other two corners gain no more than these lose
         first, second = self._face_of[p, q], self._face_of[q, p]
-        r, s, t, u = *self._after(first, q), *self._after(second, p)
+        r, s, t, u = *self._next_corners(first, q), *self._next_corners(second, p)
         for x, y in ((r, t), (s, u)):
             threes = (valence[x] < 4) + (valence[y] < 4)
             if not (
@@ -152,7 +155,7 @@ class _RotatableMesh:
             yield _Rotation((p, q), (x, y), (first, second), (self.faces[first], self.faces[second]), after)
 
     def _flat(self, first: int, second: int) -> bool:
-        """Whether two faces lie in about one plane, so that the edge between them is no crease."""
+        """Return whether two faces lie in about one plane, so that the edge between them is no crease."""
         (a, b, c), (x, y, z) = self._normal(first), self._normal(second)
         return a * x + b * y + c * z > _FLAT_COSINE
 
@@ -164,15 +167,16 @@ class _RotatableMesh:
         length = (x * x + y * y + z * z) ** 0.5 or 1.0
         return x / length, y / length, z / length
 
-    def _after(self, face: int, vertex: int) -> tuple[int, int]:
-        """Return the two corners of a face that follow a vertex."""
+    def _next_corners(self, face: int, vertex: int) -> tuple[int, int]:
+        """Return the two corners that follow a vertex in a face."""
         corners = self.faces[face]
         i = corners.index(vertex)
         return corners[(i + 1) % 4], corners[(i + 2) % 4]
 
     def _neighbours(self, vertex: int) -> list[int]:
-        """Return the other ends of the edges of an inner vertex, in order."""
-        out, face = [], self._face_at[vertex]
+        """Return the vertices at the other ends of an inner vertex's edges, in order around it."""
+        out: list[int] = []
+        face = self._face_at[vertex]
         while not out or face != self._face_at[vertex]:
             corners = self.faces[face]
             out.append(corners[corners.index(vertex) - 1])
@@ -185,12 +189,12 @@ class _RotatableMesh:
         del self._face_of[p, q], self._face_of[q, p]
         for face, quad in zip(rotation.faces, rotation.after, strict=True):
             self.faces[face] = quad
-            self._enter(face)
+            self._register(face)
         for edge, change in ((rotation.old, -1), (rotation.new, 1)):
             for vertex in edge:
                 self.valence[vertex] += change
 
-    def _enter(self, face: int) -> None:
+    def _register(self, face: int) -> None:
         """Register the directed edges of a face."""
         corners = self.faces[face]
         for i in range(4):

@@ -12,9 +12,9 @@ from gdtool.geometry.topology import compact
 def cancel_irregular(mesh: QuadMesh, rounds: int = 4) -> QuadMesh:
     """Collapse quads along a diagonal wherever that leaves fewer irregular vertices.
 
-    The merged vertex has two edges fewer than its two ends together, and the other corners lose one each (Daniels et
-    al. 2008, quad-vertex merge). A quad is collapsed only where the mesh around stays a manifold, and not beside
-    another that collapses in the same round.
+    The merged vertex has two edges fewer than its two ends together, and the quad's other two corners lose one each
+    (Daniels et al. 2008, quad-vertex merge). A quad is collapsed only where the mesh around it stays a manifold, and
+    not beside another that collapses in the same round.
     """
     vertices, faces = mesh.vertices, mesh.faces
     for _ in range(rounds):
@@ -68,7 +68,10 @@ def _is_irregular(valence: np.ndarray) -> np.ndarray:
 
 
 def _rings(faces: np.ndarray, count: int, wanted: np.ndarray) -> dict[int, set[int]]:
-    """Return for each wanted vertex all vertices of the faces around it, itself included."""
+    """Gather for each wanted vertex all vertices of the faces around it, itself included.
+
+    count: the number of vertices of the mesh.
+    """
     marked = np.zeros(count, bool)
     marked[wanted] = True
     rings: dict[int, set[int]] = {}

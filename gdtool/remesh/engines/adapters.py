@@ -17,10 +17,11 @@ _FACES_PER_QUAD = 4  # triangles per requested quad that an engine needs to see 
 
 
 def simplify_for_engine(mesh: TriMesh, quads: int, wanted: Invariants) -> TriMesh:
-    """Simplify the engine's input to what `quads` quads can show, where that keeps its invariants.
+    """Simplify an engine's input to the triangles that `quads` quads can show.
 
-    Saves half of Instant Meshes' time: it splits long edges itself, so its cost follows the vertices it is given more
-    than those it makes. Returns the input where the simplified mesh has other invariants than `wanted`.
+    This halves the time of Instant Meshes: it splits long edges itself, so its cost follows the vertices of its input
+    more than those of its output. wanted: the topology invariants of `mesh`; where simplifying changes them, the input
+    is returned.
     """
     from gdtool.geometry.simplify import collapse
 
@@ -33,10 +34,10 @@ def simplify_for_engine(mesh: TriMesh, quads: int, wanted: Invariants) -> TriMes
 
 
 def run_instant_meshes(mesh: TriMesh, quads: int, crease_degrees: float) -> QuadMesh:
-    """Run Instant Meshes (Jakob et al. 2015): a quarter as many mixed faces, then one regular subdivision to pure
-    quads.
+    """Run Instant Meshes (Jakob et al. 2015) for about `quads` quads.
 
-    Its deterministic mode, so that equal input gives equal files. Intrinsic smoothing leaves a tenth fewer irregular
+    It is asked for a quarter as many mixed faces, which one regular subdivision turns into quads. Its deterministic
+    mode is used, so that equal input gives equal files. Intrinsic smoothing would leave a tenth fewer irregular
     vertices, but its quads follow creases less well.
     """
     vertices, faces = mesh.vertices, mesh.faces

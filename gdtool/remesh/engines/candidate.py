@@ -52,10 +52,11 @@ _MIN_ENGINE_QUADS = 16  # fewer than these make the engines fail
 
 @dataclass(frozen=True)
 class EngineAttempt:
-    """One way to use an engine.
+    """An engine and the settings to call it with.
 
-    `factors` scale the quad count; one child process runs for each. `degrees` is the crease angle passed to the engine.
-    `subdivisions` regular subdivisions follow the engine, so it is asked for a quarter as many quads for each.
+    `factors` scale the quad count; one child process runs for each. `degrees` is the crease angle passed to the engine,
+    0 for none. `subdivisions`: the number of regular subdivisions after the engine. The engine is asked for a quarter
+    as many quads for each.
     """
 
     engine: str
@@ -65,7 +66,7 @@ class EngineAttempt:
 
     @property
     def label(self) -> str:
-        """Name of the attempt in the manifest."""
+        """Return the attempt's name in the manifest."""
         return (
             self.engine
             + (f", {self.subdivisions} subdivision" if self.subdivisions else "")
@@ -79,16 +80,16 @@ class EngineAttempt:
 
     @property
     def quads_per_engine_quad(self) -> int:
-        """Final quads for each quad of the engine."""
+        """Return the number of final quads for each quad of the engine."""
         return 4**self.subdivisions
 
 
 @dataclass
 class Candidate:
-    """An engine's repaired quads for one requested count, and what fitting them to the surface showed.
+    """An engine's repaired quads for one requested count, and the figures that judge them.
 
-    `fault` is the verdict on the quads as the engine left them, None where there is none. The fields from `snapped` on
-    are filled by snap() and fit().
+    `fault`: why the engine's quads differ from the surface in topology, None where they do not. snap() and fit() fill
+    the fields from `snapped` on.
     """
 
     attempt: EngineAttempt
@@ -105,46 +106,46 @@ class Candidate:
 
     @property
     def count(self) -> int:
-        """Number of quads after subdivision."""
+        """Return the number of quads after subdivision."""
         return len(self.mesh.faces) * self.attempt.quads_per_engine_quad
 
     @property
     def snapped_count(self) -> int:
-        """Number of snapped quads, subdivided and with tips; snap() comes before."""
+        """Return the number of snapped quads, subdivided and with tips; call snap() before."""
         assert self.snapped is not None
         return len(self.snapped.mesh.faces)
 
     @property
     def fitted_count(self) -> int:
-        """Number of fitted quads; fit() comes before."""
+        """Return the number of fitted quads; call fit() before."""
         assert self.fitted is not None
         return len(self.fitted.mesh.faces)
 
     def count_error(self, wanted: float) -> float:
-        """Return the relative error of the count, signed."""
+        """Return the signed relative error of the count: -0.1 is a tenth too few."""
         return self.count / wanted - 1
 
     def rank(self, wanted: float, tolerance: float) -> tuple:
-        """Return a sort key, smaller is better: faultless, then near the count, then few irregular vertices.
+        """Return a sort key, smaller is better: without a fault, then near the count, then few irregular vertices.
 
-        tolerance: relative errors of the count below this are equal.
+        tolerance: relative errors of the count below this count as equal.
         """
         return self.fault is not None, max(abs(self.count_error(wanted)), tolerance), self._irregular_count()
 
     @property
     def is_bridged(self) -> bool:
-        """Whether it is closed and manifold, but has a gap or tunnel bridged or filled."""
+        """Return whether the quads are closed and manifold, but bridge or fill a gap or tunnel."""
         return self.fault in (LOST, ADDED)
 
     @property
     def is_good(self) -> bool:
-        """Whether the fitted quads are taken without a look at other candidates."""
+        """Return whether the fitted quads are so good that no other candidate is fitted."""
         return (
             self.rejection is None and self.distance_edges < _GOOD_DISTANCE_EDGES and self.min_jacobian > _GOOD_JACOBIAN
         )
 
     def is_usable(self, patch: RemeshPatch) -> bool:
-        """Whether it has no fault, or lost only handles that are finer than its quads."""
+        """Return whether the quads have no fault, or lost only handles that are finer than a quad."""
         return (
             self.fault is None
             or self.fault == LOST
@@ -152,18 +153,18 @@ class Candidate:
         )
 
     def missing_surface(self, patch: RemeshPatch) -> str | None:
-        """Return a rejection reason where it leaves out surface that tip extrusion cannot bring back, else None."""
+        """Return a rejection reason where the quads leave out surface that tip extrusion cannot cover, else None."""
         uncovered = uncovered_shares(target_of_quads(self.mesh), patch.surface, (_UNCOVERED_EDGES * patch.edge,))[0]
         return f"{LEAVES_OUT} {uncovered:.1%} of the surface" if uncovered > _MAX_UNCOVERED_SHARE else None
 
     def raw_distance(self, patch: RemeshPatch) -> float:
-        """Return the largest distance from the surface to the engine's quads, in edge lengths (computed once)."""
+        """Return the largest distance from the surface to the engine's quads, in edge lengths; computed once."""
         if self._raw_distance_edges is None:
             self._raw_distance_edges = max_distance(target_of_quads(self.mesh), patch.surface) / patch.edge
         return self._raw_distance_edges
 
     def snap(self, patch: RemeshPatch) -> None:
-        """Snap the quads to the features and extrude tips (once)."""
+        """Snap the quads to the features and extrude tips; done once."""
         if self.snapped is None:
             self.snapped = snap_to_features(
                 self.mesh,
@@ -174,12 +175,12 @@ class Candidate:
             )
 
     def is_promising(self, patch: RemeshPatch) -> bool:
-        """Whether the snapped quads are near enough to the surface to become good."""
+        """Return whether the snapped quads are so near to the surface that fitting can make them good."""
         self.snap(patch)
         return self.snapped.distance_edges < _PROMISING_EDGES
 
     def fit(self, patch: RemeshPatch) -> None:
-        """Fit the snapped quads to the surface and judge the result (once)."""
+        """Fit the snapped quads to the surface and judge the result; done once."""
         if self.fitted is not None:
             return
         subdivisions, surface = self.attempt.subdivisions, patch.surface
@@ -204,13 +205,13 @@ class Candidate:
             self.acceptable_as_finer = rejection_reason(mesh, surface, patch.edge, FAR_EDGES, CUT_OFF)[0] is None
 
     def _irregular_count(self) -> int:
-        """Number of inner vertices without exactly four edges."""
+        """Count the inner vertices without exactly four edges."""
         valence, inner = valences(self.mesh.faces, int(self.mesh.faces.max(initial=0)) + 1)
         return int((valence[inner] != 4).sum())
 
 
 def make_candidate(mesh: TriMesh, attempt: EngineAttempt, requested: float) -> Candidate:
-    """Run an engine on triangles and judge its quads; this is the function that child processes run.
+    """Run an engine on triangles, repair its quads and judge them; child processes run this function.
 
     mesh: in a unit box. requested: final quads, after subdivision.
     """
@@ -224,7 +225,7 @@ def make_candidate(mesh: TriMesh, attempt: EngineAttempt, requested: float) -> C
 
 
 def _sort_spatially(mesh: QuadMesh) -> QuadMesh:
-    """Reorder vertices and quads so that neighbours in space are neighbours in memory; later reads hit the cache."""
+    """Reorder vertices and quads so that neighbours in space are neighbours in memory, for the cache's sake."""
     vertices, quads = mesh.vertices, mesh.faces
     if not len(quads):
         return mesh
@@ -235,7 +236,7 @@ def _sort_spatially(mesh: QuadMesh) -> QuadMesh:
 
 
 class JudgedQuads(NamedTuple):
-    """Repaired quads, and the fault that they have; None where they have none."""
+    """Repaired quads, and why their topology differs from the surface's (None where it does not)."""
 
     fault: str | None
     mesh: QuadMesh

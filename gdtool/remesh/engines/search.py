@@ -1,4 +1,4 @@
-"""Search for an engine's quads: try engines and densities in order, and fit the best candidate to the surface."""
+"""Search for an engine's quads: try engines and quad counts in order, and fit the best candidate to the surface."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ _MUCH_NEARER = 0.75  # ... and one within this share of its distance goes before
 
 
 def _attempts(quads: int, request: Request) -> list[EngineAttempt]:
-    """List the attempts for this many quads, in order.
+    """List the attempts for this many quads, in the order to try them.
 
     A coarser mesh subdivided has a quarter of the irregular vertices. It fails where features or walls are finer than
-    the coarse quads. Where a seam of the engine's fields fails, it often holds at a slightly different density.
+    the coarse quads. Where an engine's quads fail along a seam of its orientation field, a count that differs by 2 %
+    often succeeds.
     """
     engine = "instant-meshes" if request.engine == "auto" else request.engine
     attempts = (
@@ -50,31 +51,37 @@ def _attempts(quads: int, request: Request) -> list[EngineAttempt]:
 
 
 def prepare_engines(request: Request) -> None:
-    """Start the children of the first attempt now, so that they import their modules meanwhile."""
+    """Start the child processes of the first attempt, so that they import their modules while the caller works."""
     if request.engine != "split":
         prepare(make_candidate, CHILD_MODULES, _PARALLEL_CANDIDATES)
 
 
 class EngineAnswer(NamedTuple):
-    """What an engine made of a request: the count requested and the count received."""
+    """The number of quads requested from an engine, and the number that it returned."""
 
     requested: float
-    count: int
+    received: int
 
 
 def _interpolate_request(answers: list[EngineAnswer], wanted: float) -> float | None:
-    """Return a count to request between answers that were too few and too many; None without one of each."""
-    fewer = [answer for answer in answers if answer.count < wanted]
-    more = [answer for answer in answers if answer.count > wanted]
+    """Interpolate the count to request from an answer with too few quads and one with too many.
+
+    Returns None unless there is an answer of each kind.
+    """
+    fewer = [answer for answer in answers if answer.received < wanted]
+    more = [answer for answer in answers if answer.received > wanted]
     if not fewer or not more:
         return None
-    (low, below) = max(fewer, key=lambda answer: answer.count)
-    (high, above) = min(more, key=lambda answer: answer.count)
+    (low, below) = max(fewer, key=lambda answer: answer.received)
+    (high, above) = min(more, key=lambda answer: answer.received)
     return low + (high - low) * (wanted - below) / (above - below)
 
 
 class EngineSearch:
-    """The attempts on one patch, with what they showed so far."""
+    """A search for the quads of one patch, by several attempts.
+
+    record: gets the reason of each attempt that fails.
+    """
 
     def __init__(self, patch: RemeshPatch, record: Record):
         self.patch, self.record = patch, record
@@ -86,7 +93,7 @@ class EngineSearch:
         self._skipped_engines: set[str] = set()
 
     def run(self) -> QuadResult | None:
-        """Return the quads of the first attempt that pass judgement, finalized; None when none pass."""
+        """Try the attempts in order; return the first acceptable quads, finalized, or None."""
         for attempt in _attempts(self.patch.quads, self.patch.request):
             if self.patch.request.engine_seconds_left <= 0:
                 self.record.failed.append(f"{attempt.label}: not tried, the time is over")
@@ -106,7 +113,7 @@ class EngineSearch:
         return self._finalize_acceptable() or self._finalize_bridged()
 
     def _why_not_coarser(self) -> str | None:
-        """Return why a coarser mesh subdivided is known to fail, else None."""
+        """Return why subdividing a coarser mesh is known to fail on this patch, else None."""
         if self.patch.quads < _MIN_QUADS_PER_HANDLE * self.patch.handles:
             return f"so few quads lose some of {self.patch.handles} handles"
         return "its quads are wider than the strips between creases" if self.patch.has_narrow_strips else None
@@ -133,7 +140,8 @@ class EngineSearch:
                 and len(best.mesh.faces)
                 and (missing := best.missing_surface(self.patch))
             ):
-                return self._fail(attempt, missing)
+                self._fail(attempt, missing)
+                return None
             if not has_count and (usable or is_together):
                 if turn and count * _MAX_GROWTH < wanted:
                     break  # small pieces are lost however many quads are requested
@@ -149,11 +157,13 @@ class EngineSearch:
             if has_count and best.is_bridged and not attempt.subdivisions:
                 self._bridged = best
             if not usable:
-                return self._fail(attempt, best.fault, torn=best.count_error(wanted) < -_MAX_TORN_SHARE)
+                self._fail(attempt, best.fault, torn=best.count_error(wanted) < -_MAX_TORN_SHARE)
+                return None
             in_order = self._fit_order(attempt, candidates, wanted)
             taken = self._fit_first_good(self._with_right_count(in_order, tip_quads))
             if taken is not None and taken.rejection is not None:
-                return self._reject(taken)
+                self._reject(taken)
+                return None
             if taken is None:  # the first was snapped, and does not have the count together with its tips
                 taken, count = in_order[0], in_order[0].snapped_count
             else:
@@ -169,14 +179,14 @@ class EngineSearch:
         return None
 
     def _fit_order(self, attempt: EngineAttempt, candidates: list[Candidate], wanted: float) -> list[Candidate]:
-        """Return the candidates that share the fault of the best, in the order to fit them."""
+        """Sort the candidates that have the same fault as the best one into the order to fit them."""
         alike = [candidate for candidate in candidates if candidate.fault == candidates[0].fault]
         if attempt.subdivisions and len(alike) > 1:
             alike = self._nearer_first(alike, wanted)
         return alike
 
     def _reject(self, taken: Candidate) -> None:
-        """Record why a fitted candidate is rejected; keep it where it would do as a finer result."""
+        """Record why a fitted candidate is rejected; keep it if it passes the limits of results without subdivision."""
         if taken.acceptable_as_finer and self.patch.has_count(taken.fitted_count, self.patch.quads):
             self._acceptable = taken
         self._fail(taken.attempt, f"{taken.fault}; {taken.rejection}" if taken.fault else taken.rejection)
@@ -215,7 +225,7 @@ class EngineSearch:
         return sorted(candidates, key=lambda candidate: candidate.rank(wanted, patch.tolerance))
 
     def _nearer_first(self, candidates: list[Candidate], wanted: float) -> list[Candidate]:
-        """Swap the first two where the first is doubtful and the second much nearer to the surface."""
+        """Swap the first two candidates where the first is far from the surface and the second much nearer to it."""
         first, second, *others = candidates
         distance = first.raw_distance(self.patch)
         swap = (
@@ -226,9 +236,9 @@ class EngineSearch:
         return [second, first, *others] if swap else candidates
 
     def _with_right_count(self, candidates: list[Candidate], tip_quads: int) -> Iterator[Candidate]:
-        """Yield the candidates that have the wanted count together with their tips, and the hopeless ones.
+        """Yield the candidates whose count, tips included, is the wanted one, and the hopeless ones.
 
-        tip_quads: the quads of tips to expect until a candidate is snapped.
+        Hopeless: see SnappedQuads. tip_quads: the quads that tips are expected to add, until a candidate is snapped.
         """
         quads = self.patch.quads
         for candidate in candidates:
@@ -240,7 +250,10 @@ class EngineSearch:
                 yield candidate
 
     def _fit_first_good(self, candidates: Iterable[Candidate]) -> Candidate | None:
-        """Fit candidates until one is good, promising ones first; where none is, return the nearest to the surface."""
+        """Fit candidates until one is good, and return it; where none is good, return the nearest to the surface.
+
+        Promising ones come first.
+        """
         start, done = time.perf_counter(), []
         for candidate in self._promising_first(candidates):
             candidate.fit(self.patch)
@@ -259,7 +272,7 @@ class EngineSearch:
         )
 
     def _promising_first(self, candidates: Iterable[Candidate]) -> Iterator[Candidate]:
-        """Yield promising candidates as they come, the others after them."""
+        """Yield promising candidates as they come, and the others after these."""
         late = []
         for candidate in candidates:
             if candidate.is_promising(self.patch):
@@ -269,7 +282,7 @@ class EngineSearch:
         yield from late
 
     def _finalized(self, taken: Candidate) -> QuadResult:
-        """Return the finalized quads of a fitted candidate."""
+        """Finalize the quads of a fitted candidate."""
         start = time.perf_counter()
         assert taken.fitted is not None
         mesh = finalize(taken.fitted, self.patch.full_surface(), self.patch.request)
@@ -278,7 +291,10 @@ class EngineSearch:
         return QuadResult(mesh, f"{label}, {taken.fault}" if taken.fault else label)
 
     def _fail(self, attempt: EngineAttempt, reason: str, torn: bool = False) -> None:
-        """Record why an attempt failed, and skip the attempts that would fail for the same reason."""
+        """Record why an attempt failed, and skip the attempts that would fail for the same reason.
+
+        torn: whether more quads are missing than another density can bring back.
+        """
         self.record.failed.append(f"{attempt.label}: {reason}")
         if not attempt.subdivisions:
             self._stopped = self._has_pieces
@@ -287,11 +303,14 @@ class EngineSearch:
                 self._skipped_engines.add(attempt.engine)
 
     def _finalize_acceptable(self) -> QuadResult | None:
-        """Return a subdivided result that passes the limits of a finer one, where there is one."""
+        """Finalize the subdivided result that passes only the limits of results without subdivision; None if none."""
         return None if self._acceptable is None else self._finalized(self._acceptable)
 
     def _finalize_bridged(self) -> QuadResult | None:
-        """Return a result with a gap or tunnel bridged that was finer than the quads: better than no engine."""
+        """Finalize the result that bridges a gap or tunnel finer than its quads; None without one.
+
+        It is still better than the fallback.
+        """
         best = self._bridged
         if best is None:
             return None

@@ -3,8 +3,8 @@
 The result of any triangle mesh is (split_count(faces, quads), 4) quads, or about as many. No piece is lost; it is
 closed and manifold where the triangles are.
 
-Arguments in common: a mesh in a unit box; seconds and memory_mb limit each run in a child process, whose failure costs
-evenness alone; `meanwhile` is called while a child works.
+Arguments in common: a mesh in a unit box; seconds and memory_mb limit each run in a child process; `meanwhile` is
+called while a child works. If a child fails, the quads are only less uniform in size.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _COLLAPSE_FACTORS = 1.0, 1.15, 1.3, 1.6, 2.0, 4.0  # times the wanted triangles,
 
 
 def split_count(faces: np.ndarray, quads: int) -> int:
-    """Return how many quads are made when `quads` are requested: at least enough for every piece."""
+    """Return the number of quads made when `quads` are requested: at least the fewest that the pieces need."""
     return max(quads, QUADS_OF_A_PIECE * components(faces)[0])
 
 
 def too_few_for_isotropic(faces: np.ndarray, quads: int) -> bool:
-    """Whether isotropic triangles for this many quads would be too few to keep all pieces and handles."""
+    """Return whether isotropic triangles for this many quads are too few to keep all pieces and handles."""
     triangles, pieces = quads / _QUADS_PER_TRIANGLE, components(faces)[0]
     return triangles < _MIN_TRIANGLES_PER_PIECE * pieces or triangles < _MIN_TRIANGLES_PER_HANDLE * handles(
         faces, pieces
@@ -55,7 +55,7 @@ def quads_from_isotropic(
     memory_mb: int,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> QuadMesh | None:
-    """Make quads from triangles of one size and shape, of the same topology, creases sharper than crease_degrees kept.
+    """Make quads from isotropic triangles of the same topology, keeping creases sharper than crease_degrees.
 
     Returns None where no such triangles split into this many quads, as on small intricate meshes.
     """
@@ -76,12 +76,12 @@ def quads_from_isotropic(
 
 
 def _simplify_options(seconds: float, meanwhile: Callable[[], object]) -> SimplifyOptions:
-    """Return how the fallback simplifies: keeping the topology, without a measured error."""
+    """Return the fallback's options for simplifying: keep the topology, do not measure the error."""
     return SimplifyOptions(seconds, topology_first=True, measure_error=False, while_waiting=meanwhile)
 
 
 def isotropic_triangles(mesh: TriMesh, triangles: int, crease_degrees: float) -> TriMesh:
-    """Remesh to triangles of equal size and shape, about `triangles` of them, unchecked.
+    """Remesh to about `triangles` triangles of equal size and shape; the result is not checked.
 
     MeshLab's isotropic remeshing (Botsch & Kobbelt 2004, "A remeshing approach to multiresolution modeling"). Creases
     sharper than crease_degrees stay. The surface moves by a tenth of an edge at most.
@@ -120,7 +120,7 @@ def isotropic_triangles(mesh: TriMesh, triangles: int, crease_degrees: float) ->
 def quads_from_input(
     mesh: TriMesh, quads: int, seconds: float, meanwhile: Callable[[], object] = lambda: None
 ) -> QuadMesh:
-    """Make quads from the triangles of the input itself, subdivided or collapsed to the right number."""
+    """Make quads from the input's own triangles, subdivided or collapsed to the right number."""
     vertices, faces = mesh.vertices, mesh.faces
     igl = imported("igl")
     triangles = max(int(quads / _QUADS_PER_TRIANGLE), 4)
@@ -144,9 +144,9 @@ def quads_from_input(
 
 
 def _collapsed(mesh: TriMesh, triangles: int, seconds: float, meanwhile: Callable[[], object]) -> TriMesh:
-    """Collapse to `triangles` triangles, or a few more.
+    """Collapse to `triangles` triangles, or more where fewer would lose pieces.
 
-    A collapse that loses pieces is repeated more gently; where all lose some, the mesh stays as it is.
+    A collapse that loses pieces is repeated with more triangles. Where all lose some, the mesh is returned unchanged.
     """
     pieces = components(mesh.faces)[0]
     for factor in _COLLAPSE_FACTORS:
@@ -188,15 +188,15 @@ def pair_and_split(mesh: TriMesh, quads: int) -> QuadMesh:
     # Each pair spares two quads: two triangles give three each, a pair gives four.
     wanted_pairs = max((3 * len(faces) - quads + 1) // 2, 0)
     is_single = np.ones(len(faces), bool)
-    chosen = []
+    chosen_pairs: list[int] = []
     for i in np.flatnonzero(usable)[np.argsort(cosine[usable] + (1 - bend[usable]), kind="stable")].tolist():
-        if len(chosen) >= wanted_pairs:
+        if len(chosen_pairs) >= wanted_pairs:
             break
         f, g = pairs[i]
         if is_single[f] and is_single[g]:
             is_single[f] = is_single[g] = False
-            chosen.append(i)
-    chosen = np.array(chosen, np.int64)
+            chosen_pairs.append(i)
+    chosen = np.array(chosen_pairs, np.int64)
     mixed = np.full((int(is_single.sum()) + len(chosen), 4), -1, np.int64)
     mixed[: int(is_single.sum()), :3] = faces[is_single]
     if len(chosen):

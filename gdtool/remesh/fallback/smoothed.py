@@ -14,9 +14,10 @@ from gdtool.remesh.task import RemeshPatch
 
 
 def split(patch: RemeshPatch) -> QuadMesh:
-    """Make quads of any patch, from isotropic triangles or, where those fail, from the patch's triangles.
+    """Make quads of any patch, from isotropic triangles or, where those fail, from the patch's own triangles.
 
-    The quads are smoothed on the surface, each piece and each quad only where that makes it better.
+    The quads are then smoothed on the surface. Each piece and each quad keeps its smoothed vertices only where they are
+    better.
     """
     request = patch.request
     mesh = patch.input_quads

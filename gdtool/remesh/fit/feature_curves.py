@@ -52,7 +52,7 @@ class Features:
     corners: np.ndarray
 
     def share_in_strips(self, width: float) -> float:
-        """Return the share of the curves' length along strips no wider than `width`, such as the rims of thin plates.
+        """Compute the share of the curves' length along strips no wider than `width`, such as the rims of thin plates.
 
         A curve borders a strip when curves shorter than `width` meet it at both ends.
         """
@@ -107,7 +107,10 @@ def find_features(mesh: TriMesh, crease_degrees: float, shortest: float) -> Feat
 
 
 def _split_into_arcs(points: np.ndarray, segments: np.ndarray) -> Features:
-    """Number the segments (s, 2) by the arc between corners that they belong to."""
+    """Cut segments (s, 2) of points (p, 3) into arcs that end at corners.
+
+    A corner is a point of one segment, of three or more, or of two that turn by more than _CORNER_TURN_DEGREES.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -140,7 +143,7 @@ def _clean_arcs(points: np.ndarray, segments: np.ndarray, short: float) -> Featu
 
     Slivers along a crease make spurs, bubbles and doubled corners. Short arcs that end freely or return to their corner
     are dropped. A short arc between two corners is contracted into one of them. No corner travels farther than `short`
-    that way, because the arcs attached to it would leave the surface; an arc that needs more becomes a gap. Where long
+    by this, because the arcs attached to it would leave the surface; an arc that needs more becomes a gap. Where long
     segments are attached to both corners, as on the short edges of a thin plate, the arc stays.
     """
     travelled = np.zeros(len(points))  # how far the points contracted into each corner came
@@ -195,9 +198,9 @@ def _clean_arcs(points: np.ndarray, segments: np.ndarray, short: float) -> Featu
 def closest_on_segments(
     queries: np.ndarray, points: np.ndarray, segments: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the closest points on segments (s, 2) of points (p, 3).
+    """Find the closest points on segments (s, 2) of points (p, 3) to query points (n, 3).
 
-    Returns for queries (n, 3): distance (n,), segment (n,) and the closest point (n, 3).
+    Returns the distance (n,), the segment (n,) and the closest point (n, 3).
     """
     igl = imported("igl")
     squared, segment, point = igl.point_mesh_squared_distance(
@@ -210,7 +213,7 @@ def closest_on_segments(
 
 @dataclass(frozen=True)
 class Constraints:
-    """What the vertices of a quad mesh are held to.
+    """The feature curves and fixed positions that hold vertices of a quad mesh.
 
     curve (v,): the feature curve a vertex slides along, or -1. fixed (v,) bool: vertices that do not move (corners,
     tips). path (k, 2): edges of the mesh that follow curves; path_curve (k,): the curve of each.
@@ -223,16 +226,16 @@ class Constraints:
 
     @classmethod
     def none(cls, count: int) -> Constraints:
-        """Return constraints that leave `count` vertices free."""
+        """Make constraints that leave `count` vertices free."""
         return cls(np.full(count, -1), np.zeros(count, bool), np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
 
 
 def trace_features(mesh: QuadMesh, features: Features, edge: float) -> tuple[np.ndarray, Constraints]:
     """Snap paths of quad edges to the feature curves.
 
-    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do
-    not cross one another. Returns vertices (v, 3), those of paths moved onto the curves, and the constraints that hold
-    them there.
+    edge: the mean edge length. Each curve gets the shortest path of edges that stays near it. Paths do not cross one
+    another. Returns vertices (v, 3), in which those on paths lie on the curves, and the constraints that hold them
+    there.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if not features:
@@ -247,7 +250,7 @@ def trace_features(mesh: QuadMesh, features: Features, edge: float) -> tuple[np.
 
 
 class _FeatureTracer:
-    """The paths found so far on one quad mesh."""
+    """A tracer of feature curves along a quad mesh's edges, with the paths found so far."""
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, features: Features, edge: float):
         from scipy.spatial import cKDTree
@@ -321,7 +324,10 @@ class _FeatureTracer:
         return self._snapped, Constraints(self._curve, self._fixed, path, path_curve)
 
     def _mark_corridor(self, segments: np.ndarray, waypoints: list[int]) -> None:
-        """Set the distances of the free vertices near a curve; only these are looked at, for curves are many."""
+        """Set the distances of the free vertices near a curve: the corridor in which its path may run.
+
+        There are many curves, so the other vertices are not looked at.
+        """
         vertices, edge = self._vertices, self._edge
         points = self._features.points[segments]
         low, high = points.min((0, 1)) - _CORRIDOR_EDGES * edge, points.max((0, 1)) + _CORRIDOR_EDGES * edge
@@ -343,7 +349,10 @@ class _FeatureTracer:
         self._touched = np.union1d(near, waypoints)
 
     def _corridor_graph(self):
-        """Return the edges in the corridor as a sparse matrix of costs, and the vertex of each node; None for none."""
+        """Make a sparse matrix of the costs of the corridor's edges; None without edges.
+
+        Also returns the vertex of each of its nodes.
+        """
         from scipy.sparse import csr_array
 
         low_ends = self._touched[np.isfinite(self._distance[self._touched])]
@@ -403,7 +412,7 @@ class _FeatureTracer:
 
 
 def _order_points(segments: np.ndarray) -> list[int]:
-    """Return the points of one curve in order along it; the last is the first where the curve is closed."""
+    """Order the points of one curve along it; the last point equals the first where the curve is closed."""
     links: dict[int, list[int]] = {}
     for a, b in segments.tolist():
         links.setdefault(a, []).append(b)
@@ -421,24 +430,25 @@ def _order_points(segments: np.ndarray) -> list[int]:
 
 
 def release_straight_corners(mesh: QuadMesh, constraints: Constraints) -> Constraints:
-    """Release the middle of three corners of a quad that follow a feature in a straight line; the path is open there.
+    """Release the middle of three corners of a quad that follow a feature in a straight line.
 
-    A quad with a straight angle degenerates. A crease cut short by half a quad is the smaller fault.
+    A quad with a straight angle is degenerate. The path is open at the released corner: a crease cut short by half a
+    quad is the smaller fault.
     """
     vertices, faces = mesh.vertices, mesh.faces
     curve, fixed, path = constraints.curve.copy(), constraints.fixed.copy(), np.sort(constraints.path, 1)
     width = len(vertices) + 1
-    kept = np.ones(len(path), bool)
+    remaining = np.ones(len(path), bool)
     corner = faces[faces[:, 3] >= 0]
     after, before = np.roll(corner, -1, 1), np.roll(corner, 1, 1)
     straight = corner_jacobians(QuadMesh(vertices, corner), polygon_normals(QuadMesh(vertices, corner))[0]) < _STRAIGHT
 
     def on_path(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[kept])
+        return np.isin(np.minimum(a, b) * width + np.maximum(a, b), (path[:, 0] * width + path[:, 1])[remaining])
 
     between = on_path(corner, after) & on_path(before, corner)
     # At a corner of the features the angle is the surface's own: it is released only where it is straight or folded.
     release = np.unique(corner[between & (straight | ~fixed[corner])])
     curve[release], fixed[release] = -1, False
-    kept &= ~np.isin(path, release).any(1)
-    return Constraints(curve, fixed, constraints.path[kept], constraints.path_curve[kept])
+    remaining &= ~np.isin(path, release).any(1)
+    return Constraints(curve, fixed, constraints.path[remaining], constraints.path_curve[remaining])

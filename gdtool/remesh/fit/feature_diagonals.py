@@ -1,4 +1,4 @@
-"""Handle features that run across quads: hold them to diagonals, and choose the diagonals that follow the surface."""
+"""Handle features that run across quads: hold vertices to diagonals, and choose diagonals that follow the surface."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def quads_crossed_by_features(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the quads (k,) of faces (q, 4) that a feature crosses from corner to corner, and its curve (k,).
 
-    before and after are the constraints around release_straight_corners. A corner released between two held ones leaves
-    a quad whose diagonal the curve follows.
+    before and after are the constraints before and after release_straight_corners. A corner released between two held
+    ones leaves a quad whose diagonal the curve follows.
     """
     width = len(before.curve) + 1
     path = np.sort(before.path, 1)
@@ -49,7 +49,7 @@ def quads_crossed_by_features(
 
 
 def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarray, curve: np.ndarray) -> Constraints:
-    """Hold the centres of crossed quads (k,) to their curve (k,) in the constraints of the subdivided mesh.
+    """Hold the centres of quads (k,) to the curve (k,) that crosses them, in the constraints of the subdivided mesh.
 
     first_centre: the vertex at the centre of face 0.
     """
@@ -61,7 +61,8 @@ def hold_centres(constraints: Constraints, first_centre: int, face_idx: np.ndarr
 def choose_diagonals(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarray:
     """Rotate the corners of quads so that the diagonal from the first corner is the one nearer to the surface.
 
-    Quads are cut in two along that diagonal, so bent quads across a crease then follow it. Returns the faces (q, 4).
+    Quads are cut into triangles along that diagonal, so bent quads across a crease then follow it. Returns the faces
+    (q, 4).
     """
     vertices, faces = mesh.vertices, mesh.faces
     columns = gather_corners(vertices, faces)

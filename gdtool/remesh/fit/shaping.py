@@ -51,8 +51,8 @@ class SnappedQuads:
     """An engine's quads snapped to the features, subdivided and extruded over tips, before they are smoothed.
 
     tips (t,): vertices that have to stay; edge: about the edge length of the quads. distance_edges: the largest
-    distance from samples of the surface, and limit_edges: how far the fitted quads may stray, both in edge lengths.
-    hopeless: they are too far away for fitting to help.
+    distance from samples of the surface; limit_edges: the largest that the fitted quads may have, both in edge lengths.
+    hopeless: too far away for fitting to help.
     """
 
     mesh: QuadMesh
@@ -65,7 +65,7 @@ class SnappedQuads:
 
 
 class FittedQuads(NamedTuple):
-    """Quads fitted to the surface, and the constraints that hold from then on."""
+    """Quads fitted to the surface, and the constraints that later steps keep."""
 
     mesh: QuadMesh
     constraints: Constraints
@@ -78,7 +78,7 @@ def snap_to_features(
     subdivisions: int,
     request: Request,
 ) -> SnappedQuads:
-    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude tips that they cut short."""
+    """Snap an engine's quads to creases and boundaries, subdivide them, and extrude them over tips."""
     vertices, faces = mesh.vertices, mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(faces)) ** 0.5
     vertices, traced = trace_features(
@@ -146,7 +146,10 @@ def fit_to_surface(
 
 
 def finalize(fitted: FittedQuads, full_surface: ProjectionTarget, request: Request) -> QuadMesh:
-    """Balance fitted quads about the input as it was before simplification, and choose their diagonals along it."""
+    """Balance the heights of fitted quads about the full surface, and choose the diagonals that follow it.
+
+    full_surface: the input before it was simplified. Balance: see squaring.balance_heights.
+    """
     mesh = fitted.mesh
     if request.smooth_iterations:
         mesh = QuadMesh(balance_heights(mesh, full_surface, fitted.constraints), mesh.faces)
@@ -174,7 +177,7 @@ def _untangle_and_release(
     constraints: Constraints,
     tips: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Constraints]:
-    """Untangle the few quads that stay folded or thin, releasing them from features where needed."""
+    """Untangle the few quads that stay folded or thin, and release them from features where needed."""
     untangled = QuadMesh(untangle(mesh, surface, features, constraints), mesh.faces)
     return release_and_smooth(untangled, surface, features, constraints, tips=tips)
 
@@ -187,7 +190,7 @@ def smoothed(
 ) -> tuple[np.ndarray, Constraints]:
     """Snap quads to the features and smooth them on the surface, even where that makes some worse.
 
-    Returns vertices (v, 3) and constraints; keep_better_vertices() chooses between these vertices and the input's.
+    Returns vertices (v, 3) and constraints. keep_better_vertices() chooses between these vertices and the input's.
     """
     quad_faces = mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(quad_faces)) ** 0.5
@@ -214,7 +217,8 @@ def keep_better_vertices(
 ) -> np.ndarray:
     """Choose for each vertex its smoothed position or its original one, by piece and by quad.
 
-    moved (v, 3) and constraints are those of smoothed(). Smoothed positions are balanced about the full surface first.
+    moved (v, 3) and constraints are those of smoothed(). Before the choice, the smoothed quads are moved so that as
+    much of the full surface lies above as below them (squaring.balance_heights).
     """
     quad_vertices, quad_faces = mesh.vertices, mesh.faces
     edge = (polygon_normals(mesh)[1].sum() / len(quad_faces)) ** 0.5
@@ -239,7 +243,10 @@ def keep_better_vertices(
 
 
 def _abandoning_faces(surface: ProjectionTarget, mesh: QuadMesh, moved: np.ndarray, distance: float) -> np.ndarray:
-    """Return the faces (k,) whose move leaves surface farther than `distance` from all quads, and twice as far."""
+    """Find the faces (k,) whose move leaves some of the surface uncovered.
+
+    Such surface is then farther than `distance` from all quads, and twice as far as before.
+    """
     points = sample_surface(surface.mesh, _SURFACE_SAMPLES, np.random.default_rng(0))[0]
     triangles, face_idx = mesh.triangulation
     before, nearest = closest_points(points, TriMesh(mesh.vertices, triangles))[:2]
@@ -254,11 +261,11 @@ def rejection_reason(
     limit_edges: float,
     max_cut_share: float,
 ) -> tuple[str | None, float]:
-    """Judge finished quads against the surface.
+    """Judge finished quads against the surface; return the reason to reject them, or None, and their distance.
 
-    limit_edges: how far they may stray, in edge lengths. max_cut_share: share of the surface that may lie beyond an
-    edge that they cut off. Returns the reason to reject them, None where they are acceptable, and their largest
-    distance from the surface in edge lengths.
+    limit_edges: the largest distance allowed from the surface, in edge lengths. max_cut_share: the largest share of the
+    surface's area that may lie beyond an edge that the quads cut off. The distance returned is the largest from the
+    surface, in edge lengths.
     """
     quad_surface = target_of_quads(mesh)
     if (distance := max_distance(quad_surface, surface) / edge) > limit_edges:
@@ -276,12 +283,12 @@ def rejection_reason(
 
 
 def target_of_quads(mesh: QuadMesh) -> ProjectionTarget:
-    """Return the surface of the triangles that quads are cut into."""
+    """Make the projection target of the triangles that quads are cut into."""
     return ProjectionTarget(mesh.triangles)
 
 
 def max_distance(quads: ProjectionTarget, surface: ProjectionTarget) -> float:
-    """Return the largest distance from the surface's vertices (at most about 20,000 of them) to the quads.
+    """Compute the largest distance from the surface's vertices (at most about 20,000 of them) to the quads.
 
     It is large where quads are too coarse for a detail, or leave out a corner.
     """
@@ -290,12 +297,12 @@ def max_distance(quads: ProjectionTarget, surface: ProjectionTarget) -> float:
 
 
 def max_overshoot(mesh: QuadMesh, surface: ProjectionTarget) -> float:
-    """Return the largest distance from a quad's centre to the surface: large where quads bridge a gap."""
+    """Compute the largest distance from a quad's centre to the surface; it is large where quads bridge a gap."""
     return float(surface.closest(mesh.vertices[mesh.faces].mean(1))[0].max())
 
 
 def uncovered_shares(quads: ProjectionTarget, surface: ProjectionTarget, distances: tuple[float, ...]) -> list[float]:
-    """Return for each distance the share of the surface's area that lies farther from the quads."""
+    """Compute for each distance the share of the surface's area that lies farther from the quads."""
     points = sample_surface(surface.mesh, _SHARE_SAMPLES, np.random.default_rng(0))[0]
     away = quads.closest(points)[0]
     return [float((away > distance).mean()) for distance in distances]

@@ -1,4 +1,7 @@
-"""Make quads square on the surface: each quad asks for its nearest rectangle, and each vertex takes the mean."""
+"""Make quads square on the surface.
+
+Each quad is fitted with its nearest rectangle, and each vertex moves toward the mean of its rectangles' corners.
+"""
 
 from __future__ import annotations
 
@@ -38,9 +41,10 @@ _MAX_REGION_SHARE, _MIN_REGION = 5, 2000  # faces worked on at once: one over th
 
 @dataclass(frozen=True)
 class ReleaseOptions:
-    """Limits of release_and_smooth(): the scaled Jacobian that is good enough, and how bare corners may become.
+    """Limits of release_and_smooth().
 
-    max_uncovered_edges: edge lengths from a place where a vertex was to the quads once they have moved.
+    min_jacobian: quads with a smaller scaled Jacobian are worked on. max_uncovered_edges: the largest distance, in edge
+    lengths, from the old position of a vertex to the quads after they moved.
     """
 
     min_jacobian: float = 0.2
@@ -57,10 +61,10 @@ def square_up(
 ) -> np.ndarray:
     """Move vertices so that the quads get right angles, on the surface and on the feature curves.
 
-    Shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That plane says
-    which way round a quad goes, so folded quads are asked to turn over. Returns the best vertices (v, 3) met: fewest
-    folded quads first, then the largest mean Jacobian. strength: over-relaxation; at 1.2 ten rounds do what takes
-    fifteen at 0.8.
+    This is shape projection (Bouaziz et al. 2012) onto rectangles in the plane of the surface under each quad. That
+    plane fixes the orientation of each rectangle, so folded quads are unfolded. Returns the best vertices (v, 3) of all
+    rounds: those with the fewest folded quads, then the largest mean Jacobian. strength: over-relaxation; at 1.2 ten
+    rounds do what takes fifteen at 0.8.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if not len(faces) or not iterations:
@@ -97,8 +101,8 @@ def balance_heights(mesh: QuadMesh, surface: ProjectionTarget, constraints: Cons
     """Move vertices off the surface so that as much of it lies above their quads as below.
 
     A quad whose corners lie on a curved surface lies beneath it everywhere, which is half of its error. Vertices move
-    by the mean height of the surface over their quads. Features and boundaries stay where they are. So do vertices of
-    quads that do not run along the surface, and of thin quads that would become thinner.
+    by the mean height of the surface over their quads. Vertices on features and boundaries stay, as do those of quads
+    that do not run along the surface, and of thin quads that would become thinner.
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
@@ -181,18 +185,18 @@ def release_and_smooth(
     tips: np.ndarray | None = None,
     options: ReleaseOptions = ReleaseOptions(),  # noqa: B008 - frozen
 ) -> tuple[np.ndarray, Constraints]:
-    """Release the surroundings of bad quads from their feature curves and smooth them; keep what improves.
+    """Release bad quads and their neighbours from feature curves and smooth them; keep what improves.
 
-    A path along a winding crease cannot be straightened by moving vertices, so it is given up for a few quads.
-    Smoothing shrinks corners and tips of the surface: where it would uncover them by more than the options allow, the
-    vertices at corners stay. tips: vertices that stay in any case. Returns vertices and constraints.
+    A path along a winding crease cannot be straightened by moving vertices, so a few quads give it up. Smoothing
+    shrinks corners and tips of the surface. Where it would uncover them by more than the options allow, the vertices at
+    corners stay. tips: vertices that always stay. Returns vertices and constraints.
     """
     vertices, faces = mesh.vertices, mesh.faces
-    in_vain, left = 0, np.inf
+    in_vain, bad_count = 0, np.inf
     for turn in range(_RELEASE_ROUNDS):
         bad = scaled_jacobian(QuadMesh(vertices, faces)) < options.min_jacobian
-        in_vain, left = in_vain + 1 if bad.sum() > _MOST_LEFT * left else 0, bad.sum()
-        if not left or in_vain == _MAX_ROUNDS_IN_VAIN and left > _FEW_BAD:
+        in_vain, bad_count = in_vain + 1 if bad.sum() > _MOST_LEFT * bad_count else 0, bad.sum()
+        if not bad_count or in_vain == _MAX_ROUNDS_IN_VAIN and bad_count > _FEW_BAD:
             break
         near = np.zeros(len(vertices), bool)
         near[faces[bad]] = True
@@ -236,7 +240,7 @@ def _smooth_region(
     constraints: Constraints,
     turn: int,
 ) -> np.ndarray:
-    """Smooth, square up and untangle a small region, the more rounds the later the turn."""
+    """Smooth, square up and untangle a small region, with more rounds the higher `turn` is."""
     vertices, faces = mesh.vertices, mesh.faces
     vertices = relax(QuadMesh(vertices, faces), surface, features, constraints, 10 + 10 * turn)
     vertices = square_up(QuadMesh(vertices, faces), surface, features, constraints, 10)
@@ -244,22 +248,25 @@ def _smooth_region(
 
 
 def _released(constraints: Constraints, released: np.ndarray) -> Constraints:
-    """Return constraints without those of some vertices (v,) bool, and without the path edges at them."""
-    kept = ~released[constraints.path].any(1)
+    """Remove some vertices, released (v,) bool, and the path edges at them from constraints."""
+    remaining = ~released[constraints.path].any(1)
     return Constraints(
         np.where(released, -1, constraints.curve),
         constraints.fixed & ~released,
-        constraints.path[kept],
-        constraints.path_curve[kept],
+        constraints.path[remaining],
+        constraints.path_curve[remaining],
     )
 
 
 def _uncovers_surface(before: np.ndarray, after: np.ndarray, faces: np.ndarray, most: float) -> bool:
-    """Whether moving vertices leaves a place where one was more than `most` edge lengths from the quads (f, 4)."""
+    """Return whether some vertex's old position is farther from the moved quads (f, 4) than `most` edge lengths."""
     edge = (polygon_normals(QuadMesh(before, faces))[1].sum() / len(faces)) ** 0.5
     return bool(closest_points(before, TriMesh(after, triangulated(faces)[0]))[0].max() > most * edge)
 
 
 def _badness(jacobian: np.ndarray, limit: float) -> tuple[int, int, float]:
-    """Return a key to compare quads by, smaller is better: folded ones, those below `limit`, the worst."""
+    """Compute a key that compares sets of quads; less is better.
+
+    It counts the folded quads, then those with a scaled Jacobian below `limit`, then takes the worst.
+    """
     return int((jacobian <= 0).sum()), int((jacobian < limit).sum()), -float(jacobian.min())

@@ -20,7 +20,7 @@ _DOUBLET_ROUNDS = 8  # of removal; each can make new doublets
 
 
 class ProjectionTarget(SearchTree):
-    """A triangle mesh to project points to, with its search tree and the normals (f, 3) of its faces."""
+    """A triangle mesh to project points onto, with its search tree and the normals (f, 3) of its faces."""
 
     def __init__(self, mesh: TriMesh):
         super().__init__(mesh)
@@ -69,7 +69,7 @@ def subdivide(mesh: QuadMesh, constraints: Constraints | None = None) -> tuple[Q
 
 
 def _average_matrix(pairs: np.ndarray, count: int):
-    """Return the sparse (count, count) matrix that averages the neighbours of each vertex; pairs (e, 2) are edges."""
+    """Make the sparse (count, count) matrix that averages the neighbours of each vertex; pairs (e, 2) are edges."""
     from scipy.sparse import coo_matrix, diags
 
     rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
@@ -81,15 +81,15 @@ def _average_matrix(pairs: np.ndarray, count: int):
 def project(
     vertices: np.ndarray, surface: ProjectionTarget, features: Features, constraints: Constraints
 ) -> np.ndarray:
-    """Project vertices onto the surface; held ones onto their feature curve; fixed ones stay."""
+    """Project vertices (v, 3): free ones onto the surface, held ones onto their feature curve; fixed ones stay."""
     return ConstrainedProjector(surface, features, constraints).exact(vertices)
 
 
 class ConstrainedProjector:
-    """Projects vertices that move in small steps.
+    """A projector for vertices that move in small steps.
 
-    Every few steps the closest point is searched; between them a vertex goes to the plane, or the line of its curve,
-    that it was projected to last.
+    It searches for the closest point once in _EXACT_EVERY steps. Between, a vertex is projected to the plane of its
+    last closest triangle, or to the line of its curve's last segment.
     """
 
     def __init__(self, surface: ProjectionTarget, features: Features, constraints: Constraints):
@@ -108,7 +108,7 @@ class ConstrainedProjector:
         self.placed: np.ndarray | None = None  # the last result of exact()
 
     def exact(self, vertices: np.ndarray) -> np.ndarray:
-        """Project vertices (v, 3) to the closest points; held ones on their curve; fixed ones stay."""
+        """Project vertices (v, 3) to their closest points; held ones on their curve; fixed ones stay."""
         out = vertices.copy()
         _, face_idx, point = self._surface.closest(vertices[self._free])
         out[self._free] = point
@@ -126,7 +126,8 @@ class ConstrainedProjector:
     def step(self, moved: np.ndarray, vertices: np.ndarray, last: bool) -> np.ndarray:
         """Project vertices that moved from `vertices`, which lay on the surface, to `moved` (v, 3).
 
-        Exact in the last step and every few; approximate between.
+        The closest points are searched in the last step (`last`) and in every few; between, planes and lines
+        approximate them.
         """
         self._steps += 1
         if last or self._normals is None or self._steps % _EXACT_EVERY == 0:
@@ -170,7 +171,7 @@ def relax(
 
 
 def immovable_vertices(edges: Edges, count: int, constraints: Constraints) -> np.ndarray:
-    """Return (v,) bool: the vertices that may not move.
+    """Mark the vertices that may not move, (v,) bool.
 
     They are the fixed ones, and those on boundaries that no curve holds.
     """
@@ -180,7 +181,7 @@ def immovable_vertices(edges: Edges, count: int, constraints: Constraints) -> np
 
 
 def surface_normals_below(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarray:
-    """Return (f, 3) unit normals of the surface under each quad, sampled at its centre.
+    """Sample unit normals (f, 3) of the surface under each quad, at its centre.
 
     Where the surface bends away from the quad's own normal, points half-way to its corners are sampled too.
     """
@@ -195,7 +196,10 @@ def surface_normals_below(mesh: QuadMesh, surface: ProjectionTarget) -> np.ndarr
 
 
 class GroupedLists:
-    """Values (n,) grouped by key (n,) in 0 ... count - 1, each group in the order given: lists[key] is an array."""
+    """Values (n,) grouped by key (n,) in 0 ... count - 1, in the order given within each group.
+
+    lists[key] is an array.
+    """
 
     def __init__(self, key: np.ndarray, value: np.ndarray, count: int):
         self.value = value[np.argsort(key, kind="stable")]
@@ -227,7 +231,7 @@ def neighbours(ends: np.ndarray, count: int) -> GroupedLists:
 def fill_holes(mesh: QuadMesh, longest: int = 64) -> QuadMesh:
     """Close boundary loops with an even number of edges, at most `longest`, by quads around a new vertex.
 
-    Where two holes meet at a vertex, each is closed by itself.
+    Where two holes meet at a vertex, they are closed separately.
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
@@ -240,20 +244,23 @@ def fill_holes(mesh: QuadMesh, longest: int = 64) -> QuadMesh:
     starts: dict[int, list[int]] = {}
     for k, vertex in enumerate(half[:, 0].tolist()):
         starts.setdefault(vertex, []).append(k)
-    following = []
+    following: list[int | None] = []
     for k, vertex in enumerate(half[:, 1].tolist()):
         choices = starts.get(vertex, [])
         if len(choices) == 2:  # a hole's boundary arrives on one of the two fans and leaves on the other
             choices = [on for on in choices if leaving[on] != arriving[k]]
         following.append(choices[0] if len(choices) == 1 else None)  # where more holes meet, the way is ambiguous
-    new_points, new_faces, seen = [], [], set()
+    new_points: list[np.ndarray] = []
+    new_faces: list[list[int]] = []
+    seen: set[int] = set()
     for start in range(len(half)):
-        loop, k = [], start
-        while k is not None and k not in seen and len(loop) <= longest:
-            seen.add(k)
-            loop.append(int(half[k, 0]))
-            k = following[k]
-        if k != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
+        loop: list[int] = []
+        half_edge: int | None = start
+        while half_edge is not None and half_edge not in seen and len(loop) <= longest:
+            seen.add(half_edge)
+            loop.append(int(half[half_edge, 0]))
+            half_edge = following[half_edge]
+        if half_edge != start or len(loop) % 2 or not 4 <= len(loop) <= longest or len(set(loop)) < len(loop):
             continue
         loop = loop[::-1]  # the new faces traverse the edges in the opposite direction
         if len(loop) == 4:

@@ -1,4 +1,4 @@
-"""Extrude tips and rims of the surface that quads leave uncovered: engines cut short what is thinner than a quad."""
+"""Extrude tips and rims of the surface that quads leave uncovered: engines cut off what is thinner than a quad."""
 
 from __future__ import annotations
 
@@ -29,8 +29,9 @@ _SAMPLES = 20000  # points of the surface: half vertices, half spread over its a
 class ExtrudedQuads(NamedTuple):
     """Quads extruded over the tips of a surface.
 
-    tips (t,): the vertices at tips, fixed in the constraints. distance: the largest from the surface to the quads
-    before the last vertices moved. sample_distances (n,): those of samples spread over its area.
+    tips (t,): the vertices at tips, fixed in the constraints. distance: the largest from the surface to the quads.
+    sample_distances (n,): distances of samples spread over the surface's area. Both were measured before the last
+    vertices moved.
     """
 
     mesh: QuadMesh
@@ -41,7 +42,7 @@ class ExtrudedQuads(NamedTuple):
 
 
 class _Tip(NamedTuple):
-    """Samples of the surface that the quads leave uncovered: points (n, 3), nearest quads (n,), distances (n,)."""
+    """A part of the surface that the quads leave uncovered: points (n, 3), their nearest quads (n,), distances (n,)."""
 
     points: np.ndarray
     quads: np.ndarray
@@ -55,12 +56,12 @@ def extrude_tips(
     edge: float,
     max_added: float = 0.03,
 ) -> ExtrudedQuads:
-    """Extrude quads of mean edge length `edge` over the parts of the surface that stray from them.
+    """Extrude quads of mean edge length `edge` over the parts of the surface that they leave uncovered.
 
     The farthest tip goes first. The vertices nearest to it move along it, an edge or two at a time, with the quads
-    around them, and a ring of new quads follows each step, as one models a horn by hand. It ends when max_added of the
-    quads are new: surfaces that need more have other faults than tips. A tip nearer than an edge takes one vertex and
-    no ring. The quads stay closed and manifold as they were, with as many pieces and handles.
+    around them, and each step inserts a ring of new quads, as one models a horn by hand. It ends when the share
+    max_added of the quads is new: surfaces that need more have other faults than tips. A tip nearer than an edge takes
+    one vertex and no ring. The quads stay closed and manifold where they were, with as many pieces and handles.
     """
     vertices, faces = mesh.vertices, mesh.faces
     step = max(len(surface.vertices) // _SAMPLES, 1)
@@ -134,9 +135,10 @@ def _move_to_near_tips(
 
 
 def _nearest_within(points: np.ndarray, away: np.ndarray, mesh: TriMesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances (n,) from points (n, 3) to a mesh, and the nearest triangles (n,).
+    """Compute the distances (n,) from points (n, 3) to a mesh, and their nearest triangles (n,).
 
-    away (n,): about what the distances will be. Few points are searched for among the triangles that near alone.
+    away (n,): estimates of the distances. Triangles farther away than the largest of these are searched only if a point
+    is.
     """
     from scipy.spatial import cKDTree
 
@@ -215,7 +217,7 @@ def _extrude_tip(
 
 
 def _spaced_out(points: np.ndarray, order: list[int], distance: float) -> list[int]:
-    """Choose points (n, 3) greedily in the given order, each farther than `distance` from those chosen before."""
+    """Choose points (n, 3) greedily in the given order, each farther than `distance` from those chosen before it."""
     chosen: list[int] = []
     for k in order:
         if (np.linalg.norm(points[chosen] - points[k], axis=1) > distance).all():
@@ -224,9 +226,9 @@ def _spaced_out(points: np.ndarray, order: list[int], distance: float) -> list[i
 
 
 def _disc_boundary(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.ndarray | None:
-    """Return the directed edges (n, 2) around a patch of faces (f,) bool, in order.
+    """Find the boundary of a patch of faces (f,) bool: its directed edges (n, 2), in order.
 
-    None unless the patch is a disc whose inner vertices are exactly `cap`.
+    Returns None unless the patch is a disc whose inner vertices are exactly `cap`.
     """
     patch_faces = faces[patch]
     edges = edges_of(patch_faces)
@@ -256,7 +258,7 @@ def _disc_boundary(faces: np.ndarray, patch: np.ndarray, cap: np.ndarray) -> np.
 
 
 def _extend_constraints(constraints: Constraints, count: int, moved: np.ndarray, fixed: np.ndarray) -> Constraints:
-    """Extend constraints to `count` vertices: those that moved are released, `fixed` ones hold still; paths stay."""
+    """Extend constraints to `count` vertices: release those that moved, and fix the `fixed` ones; paths stay."""
     curve, is_fixed = np.full(count, -1), np.zeros(count, bool)
     curve[: len(constraints.curve)], is_fixed[: len(constraints.fixed)] = constraints.curve, constraints.fixed
     curve[moved], is_fixed[moved], is_fixed[fixed] = -1, False, True
@@ -264,9 +266,9 @@ def _extend_constraints(constraints: Constraints, count: int, moved: np.ndarray,
 
 
 def _remaining_paths(constraints: Constraints, faces: np.ndarray) -> Constraints:
-    """Drop path edges that are no edges of the faces any more, or are no longer held at both ends."""
+    """Drop path edges that are no longer edges of the faces, or no longer held at both ends."""
     ends, path, width = edges_of(faces).ends, np.sort(constraints.path, 1), len(constraints.curve) + 1
-    kept = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
+    remaining = np.isin(path[:, 0] * width + path[:, 1], ends[:, 0] * width + ends[:, 1]) & (
         constraints.curve[path] >= 0
     ).all(1)
-    return replace(constraints, path=constraints.path[kept], path_curve=constraints.path_curve[kept])
+    return replace(constraints, path=constraints.path[remaining], path_curve=constraints.path_curve[remaining])

@@ -35,10 +35,10 @@ def untangle(
 ) -> np.ndarray:
     """Move vertices of folded and needle-like quads to the best of a few positions near them.
 
-    A vertex moves only where the worst scaled Jacobian of its quads, against the surface's normals, improves. Free
-    vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it. max_visits
-    bounds the work by a count, not a time, so that equal input gives equal output. Vertices that share no quad move at
-    once. Returns vertices (v, 3).
+    A vertex moves only where that improves the worst scaled Jacobian of its quads, measured against the surface's
+    normals. Free vertices stay on the surface, held ones slide along their curve; in the last rounds they may leave it.
+    max_visits bounds the work by a count, not a time, so that equal input gives equal output. Vertices that share no
+    quad move at once. Returns vertices (v, 3).
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
@@ -89,7 +89,10 @@ def untangle(
 def _batch_positions(
     vertices: np.ndarray, batch: np.ndarray, faces: np.ndarray, face_lists: GroupedLists, neighbour_lists: GroupedLists
 ) -> np.ndarray:
-    """Return (n, _POSITIONS, 3) positions for a batch, computed together for vertices with equally many neighbours."""
+    """Compute positions (n, _POSITIONS, 3) that a batch of vertices (n,) may move to.
+
+    Vertices with equally many faces and neighbours are computed together.
+    """
     size = np.stack([face_lists.lengths(batch), neighbour_lists.lengths(batch)], -1)
     positions = np.empty((len(batch), _POSITIONS, 3))
     for alike in {tuple(lengths) for lengths in size.tolist()}:
@@ -105,8 +108,8 @@ def _independent_batches(chosen: np.ndarray, faces: np.ndarray, face_lists: Grou
     batches: list[list[int]] = []
     color: dict[int, int] = {}
     for v in chosen.tolist():
-        taken = {color.get(u) for u in faces[face_lists[v]].ravel().tolist()}
-        color[v] = next(c for c in range(len(taken) + 1) if c not in taken)
+        used_colors = {color.get(u) for u in faces[face_lists[v]].ravel().tolist()}
+        color[v] = next(c for c in range(len(used_colors) + 1) if c not in used_colors)
         if color[v] == len(batches):
             batches.append([])
         batches[color[v]].append(v)
@@ -116,11 +119,11 @@ def _independent_batches(chosen: np.ndarray, faces: np.ndarray, face_lists: Grou
 def _candidate_positions(
     vertices: np.ndarray, batch: np.ndarray, quads: np.ndarray, neighbour_idx: np.ndarray
 ) -> np.ndarray:
-    """Return (n, _POSITIONS, 3) positions that vertices (n,) may move to; the first is where they are.
+    """Compute the positions (n, _POSITIONS, 3) that vertices (n,) may move to; the first is where they are.
 
     quads (n, k, 4) and neighbours (n, m) around them.
     """
-    here, beside = vertices[batch][:, None], vertices[neighbour_idx]
+    present, beside = vertices[batch][:, None], vertices[neighbour_idx]
     mean = beside.mean(1, keepdims=True)
     radius = np.linalg.norm(beside - mean, axis=2).mean(1)[:, None, None]
     axes = np.linalg.svd(beside - mean, full_matrices=False)[2]
@@ -131,12 +134,12 @@ def _candidate_positions(
     )
     return np.concatenate(
         [
-            here,
+            present,
             mean,
             vertices[quads].mean((1, 2))[:, None],
-            (mean + here) / 2,
-            here + _NEAR_RING * radius * circle,
-            here + _FAR_RING * radius * circle,
+            (mean + present) / 2,
+            present + _NEAR_RING * radius * circle,
+            present + _FAR_RING * radius * circle,
         ],
         1,
     )
@@ -148,7 +151,7 @@ def _best_position(
     """Choose for each vertex the position that makes the worst quad around it best.
 
     quads (n, k, 4) around the vertices, normals (n, k, 3) of the surface under them, positions (n, p, 3). Returns the
-    index of the best position (n,) and (n,) bool whether it is better than to stay.
+    index (n,) of the best position, and (n,) bool: whether it is better than the present one.
     """
     n, p, k = *positions.shape[:2], quads.shape[1]
     corners = np.where(

@@ -20,7 +20,7 @@ class OrientedChart(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Where a chart stands: its number of quarter turns, and the cell of its mask's corner."""
+    """The place of a chart: its number of quarter turns, and the cell of its mask's corner."""
 
     turn: int
     x: int
@@ -28,7 +28,10 @@ class Placement(NamedTuple):
 
 
 class Run(NamedTuple):
-    """A run of cells, covered by 2**level cells from `first` and from `second` on; axis 1 is down a column."""
+    """A run of 2**level or more cells in a row (axis 0) or a column (axis 1) of a mask.
+
+    It is covered by 2**level cells from `first` on and as many from `second` on, which may overlap.
+    """
 
     axis: int
     level: int
@@ -58,8 +61,8 @@ def orient_upright(uv: np.ndarray) -> np.ndarray:
 def _mask(rim: np.ndarray, span: np.ndarray, cells_per_unit: float, gap: float, share: float) -> np.ndarray:
     """Rasterise a chart grown by `gap` cells: (h, w) bool, the cells of which more than a share is covered.
 
-    rim (s, 2, 2): the outline of the chart, which lies in [0, span] with its corner at cell (gap, gap). Supersampled.
-    With a share of 0 no cell within `gap` of the chart is missed.
+    rim (s, 2, 2): segments of the chart's outline, in [0, span]; (0, 0) goes to the corner of cell (gap, gap). Cells
+    are supersampled. With a share of 0 no cell within `gap` of the chart is missed.
     """
     shape = np.ceil(span * cells_per_unit + 2 * gap).astype(int)
     width, height = shape * _FINE
@@ -109,7 +112,7 @@ def _sample_segments(outline: np.ndarray) -> np.ndarray:
 
 
 def outline_of(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the outline of a chart: (s, 2, 2) uv of the edges that one triangle alone has."""
+    """Find the outline (s, 2, 2) of a chart: the uv of the edges that belong to one triangle only."""
     following = triangles[:, [1, 2, 0]]
     key = np.sort(
         (np.minimum(triangles, following).astype(np.int64) * len(uv) + np.maximum(triangles, following)).ravel()
@@ -124,7 +127,7 @@ def rotated_masks(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Rasterise a chart, with half the gap around it, at each quarter turn.
 
-    Returns the four masks, and the chart's uv (v, 2) in cells of each.
+    rim (s, 2, 2): the chart's outline. Returns the four masks, and for each of them the chart's uv (v, 2) in its cells.
     """
     mask = _mask(rim, uv.max(0), cells_per_unit, gap / 2, share)
     h, w = mask.shape
@@ -138,13 +141,12 @@ def rotated_masks(
 
 
 class ChartMasks:
-    """Charts as masks at one resolution and at each quarter turn, stored as integers of bits.
+    """Masks of all charts at one resolution and at each quarter turn, stored as integers of bits.
 
     The cell (x, y) is bit y * (side + 1) + x, so that shifting an integer moves the chart. All places of a chart are
-    tested by one shift per run of its cells, or per chart already placed.
-
-    charts: oriented charts; cells_per_unit: cells per unit of surface; gap: cells between charts; side: of the largest
-    square to pack into; share: of a cell that has to be covered, see _mask().
+    tested by one shift per run of its cells, or per chart already placed. charts: oriented charts; cells_per_unit:
+    cells per unit of surface; gap: cells between charts; side: of the largest square to pack into, in cells; share: of
+    a cell that has to be covered, see _mask().
     """
 
     def __init__(self, charts: list[OrientedChart], cells_per_unit: float, gap: float, side: int, share: float = 0.0):
@@ -175,7 +177,7 @@ class ChartMasks:
             self._rim.append(cells.bit_count() - inner.bit_count())
 
     def border(self, side: int) -> int:
-        """Return the cells along the border of a square of `side` cells."""
+        """Return the cells along the border of a square of `side` cells, as bits."""
         return (
             (1 << side) - 1
             | ((1 << side) - 1) << (side - 1) * self.stride
@@ -193,14 +195,14 @@ class ChartMasks:
     ) -> Placement | None:
         """Find the best free place of chart i in a square of `side` cells, None where there is none.
 
-        taken: the cells that are occupied. The chart goes where it stays low; contact weighs how much it touches others
-        and the walls, border(side), against that. others: the charts that occupy these cells and their placements. With
-        them the test is quicker where the same few charts are placed over and over, because what two charts block of
-        each other is cached.
+        taken: the occupied cells, as bits. The best place is low; `contact` weighs how much the chart touches others
+        and the walls, border(side), against that. others: the charts that occupy these cells and their placements. They
+        make the test quicker where the same few charts are placed over and over, because the places that one chart
+        blocks for another are cached.
         """
         stride = self.stride
         touching = taken << 1 | taken >> 1 | taken << stride | taken >> stride | border
-        windows = {}, {}
+        windows: tuple[dict[int, int], dict[int, int]] = {}, {}
         best = None
         for turn in self._turns[i]:
             h, w = self.shapes[i][turn]
@@ -234,7 +236,7 @@ class ChartMasks:
         return best and Placement(*best[1:])
 
     def _blocked_places(self, i: int, turn: int, others: list[tuple[int, Placement]]) -> int:
-        """Return the places where chart i at this turn overlaps one of the others."""
+        """Return the places where chart i at this turn overlaps one of the others, as bits."""
         h, w = self.shapes[i][turn]
         hit, last, stride, meetings = 0, (h - 1) * self.stride + w - 1, self.stride, self._meetings
         # The places where it meets a cell are its cells mirrored there: its half turn, last cell in place of the first.
@@ -250,10 +252,10 @@ class ChartMasks:
         return hit
 
     def _minkowski_sum(self, first: int, second: int) -> int:
-        """Return the Minkowski sum of two charts' cells; each chart is given as 4 i + turn.
+        """Compute the Minkowski sum of two charts' cells, as bits; each chart is given as 4 i + turn.
 
-        Rows longer than the stride continue in the next row. What lands there comes from left of the square, and no
-        chart whose first cell is there would end within the square.
+        Rows longer than the stride continue in the next row. The cells that come to lie there are left of the square,
+        where no chart that fits into the square has its first cell.
         """
         if len(self.runs[first // 4][first % 4]) > len(self.runs[second // 4][second % 4]):
             first, second = second, first
@@ -268,12 +270,12 @@ class ChartMasks:
         return out
 
     def cells_at(self, i: int, at: Placement) -> int:
-        """Return the cells that chart i takes at a placement."""
+        """Return the cells that chart i takes at a placement, as bits."""
         turn, x, y = at
         return self.bits[i][turn] << y * self.stride + x
 
     def extent_at(self, i: int, at: Placement) -> int:
-        """Return the side of the smallest square that holds chart i at a placement."""
+        """Compute the side in cells of the smallest square that holds chart i at a placement."""
         (h, w), (_, x, y) = self.shapes[i][at[0]], at
         return max(x + w, y + h)
 
@@ -286,10 +288,10 @@ def _free_places(
     side: int,
     stride: int,
 ) -> int:
-    """Return the places in a square of `side` cells where a chart is clear of the taken cells.
+    """Return the places in a square of `side` cells where a chart is clear of the taken cells, as bits.
 
-    runs and size (h, w) of the chart. windows: a cache for rows and for columns; by level k, the cells from which on
-    any of 2**k cells is taken.
+    runs and size (h, w) of the chart. windows: a cache for rows and for columns. By level k it holds the cells from
+    which on at least one of 2**k cells is taken.
     """
     free, hit = _repeat_row((1 << side - size[1] + 1) - 1, side - size[0] + 1, stride), 0
     for number, (axis, level, first_start, second_start) in enumerate(runs, 1):
@@ -305,7 +307,7 @@ def _free_places(
 
 
 def _spread_bits(cells: int, known: dict[int, int], level: int, step: int) -> int:
-    """Return cells spread over 2**level places, `step` bits apart; `known` caches lower levels."""
+    """Set the bits of `cells` at 2**level places, `step` bits apart; `known` caches lower levels."""
     if level not in known:
         if not level:
             known[level] = cells
@@ -316,7 +318,7 @@ def _spread_bits(cells: int, known: dict[int, int], level: int, step: int) -> in
 
 
 def _repeat_row(row: int, count: int, stride: int) -> int:
-    """Return the bits of one row repeated in `count` rows."""
+    """Repeat the bits of one row in `count` rows."""
     out, have = row, 1
     while have < count:
         more = min(have, count - have)
@@ -326,14 +328,14 @@ def _repeat_row(row: int, count: int, stride: int) -> int:
 
 
 def bits_of(mask: np.ndarray, stride: int) -> int:
-    """Return a mask (h, w) bool as one integer, rows `stride` bits apart."""
+    """Pack a mask (h, w) bool into one integer, rows `stride` bits apart."""
     rows = np.zeros((mask.shape[0], stride), bool)
     rows[:, : mask.shape[1]] = mask
     return int.from_bytes(np.packbits(rows, bitorder="little").tobytes(), "little")
 
 
 def _set_bits(bits: int) -> np.ndarray:
-    """Return the numbers of the bits that are set."""
+    """List the numbers of the bits that are set."""
     return np.flatnonzero(
         np.unpackbits(
             np.frombuffer(bits.to_bytes(bits.bit_length() // 8 + 1, "little"), np.uint8), bitorder="little"
@@ -342,7 +344,7 @@ def _set_bits(bits: int) -> np.ndarray:
 
 
 def _runs(mask: np.ndarray, stride: int) -> tuple[list[Run], list[Run]]:
-    """Return the runs of cells in a mask (h, w), longest first, for the mask and for its half turn.
+    """Find the runs of cells in a mask (h, w), longest first, for the mask and for its half turn.
 
     Runs go along rows, or along columns where these are fewer.
     """

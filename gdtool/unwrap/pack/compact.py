@@ -1,4 +1,4 @@
-"""Compact a layout of charts from a coarse grid on a fine one, where none comes too near another."""
+"""Compact a layout of charts, found on a coarse grid, on a fine grid; the gap between charts is kept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _FIRST_STEP = 1 << 5  # cells of the first move; halved where it is blocked
 
 
 class FineGridCompactor:
-    """Charts on a grid finer than their masks', about `cells` cells a side, with the gap around them.
+    """Charts on a grid of about `cells` cells a side, finer than that of their masks, each with the gap around it.
 
     sides: of the layouts that will be moved to this grid, the best first, in cells of the masks. gap: between charts,
     in uv.
@@ -61,8 +61,8 @@ class FineGridCompactor:
     def compact(self, layouts: list[list[Placement]]) -> tuple[list[np.ndarray], float] | None:
         """Separate the charts of each layout and push them together; return the layout with the smallest square.
 
-        Charts move up, then to the left, as far as they can, again and again. Returns uv of each chart in the unit
-        square and their scale, as pack() does; None where no layout can be separated.
+        Charts move up, then left, as far as they can, again and again. Returns uv of each chart in the unit square and
+        their scale, as pack() does; None where no layout can be separated.
         """
         best, best_used = None, self._max_side + 1
         for layout in layouts:
@@ -80,7 +80,7 @@ class FineGridCompactor:
         return best and ([uv / best_used for uv in best], self._cells_per_unit / best_used)
 
     def _masks(self, layout: list[Placement]) -> tuple[list[int], list[tuple[int, int]]]:
-        """Return the bits of the charts as they are turned, and their sizes (h, w)."""
+        """Return the bits of the charts at their quarter turns in a layout, and their sizes (h, w)."""
         return [self._bits[i, at.turn] for i, at in enumerate(layout)], [
             self._turned[i][0][at.turn].shape for i, at in enumerate(layout)
         ]
@@ -89,7 +89,7 @@ class FineGridCompactor:
 def _separate_masks(
     masks: list[int], sizes: list[tuple[int, int]], wanted: list[np.ndarray], most: int
 ) -> tuple[list[list[int]], int] | None:
-    """Find places [x, y] near the wanted ones for masks of sizes (h, w), clear of each other.
+    """Find places [x, y] near the wanted ones where masks of sizes (h, w) are clear of each other.
 
     Returns the places and the cells taken, or None where a mask finds no place.
     """
@@ -113,7 +113,7 @@ def _separate_masks(
 def _push_together(
     masks: list[int], sizes: list[tuple[int, int]], place: list[list[int]], taken: int, stride: int
 ) -> tuple[list[list[int]], int]:
-    """Move masks up, then to the left, as far as they can, again and again.
+    """Move masks up, then left, as far as they can, again and again.
 
     Returns their places and the side of the square they use.
     """

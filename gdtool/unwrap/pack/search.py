@@ -1,4 +1,7 @@
-"""Pack charts into the unit square: search for the order that gives the smallest square; charts turn, never mirror."""
+"""Pack charts into the unit square: search for the order that gives the smallest square.
+
+Charts are turned by quarters, but never mirrored.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +39,17 @@ _MAX_SEARCHED = 160  # charts for which orders are searched
 
 
 class PlacementOrder(NamedTuple):
-    """The order to place charts in, and the weight of contact with others against a low place."""
+    """The order to place charts in, and the weight of contact between charts against a low place.
+
+    contact: see ChartMasks.find_place.
+    """
 
     order: list[int]
     contact: float
 
 
 class Layout(NamedTuple):
-    """Charts in a square of `side` cells: the placement of each, the order they were placed in, weight of contact."""
+    """Charts placed in a square of `side` cells: their placements, the order of placing, and the weight of contact."""
 
     side: int
     at: list[Placement]
@@ -52,24 +58,24 @@ class Layout(NamedTuple):
 
 
 class BestCut(NamedTuple):
-    """The way to cut that packs best.
+    """The set of charts that packs best, of several that each cut the surface further.
 
-    index: its number; share: of the square that it fills (0, 0 where none can be told); orders: to pack it in;
-    skipped: how many ways were passed over.
+    number: which of the sets, from 0 on. share: of the square that the set fills; 0 (with number 0) where no set could
+    be packed. orders: the best orders to pack it in. skipped: the number of sets that were passed over.
     """
 
-    index: int
+    number: int
     share: float
     orders: list[PlacementOrder]
     skipped: int
 
 
 def choose_cut(variants: Iterable[list[tuple[np.ndarray, np.ndarray]]], gap: float) -> BestCut:
-    """Choose the way to cut a surface into charts that packs best, by a short search.
+    """Choose the set of charts that packs best, by a short search for each.
 
-    variants: charts (uv, triangles), each variant cut a step further than the one before. The first that fills
-    WELL_PACKED of the square is taken. Where one lacks several times _MAX_STEP_GAIN of that, the next ones are passed
-    over. A later variant has to gain more than the seams it adds are worth.
+    variants: sets of charts (uv, triangles) of one surface, each cut a step further than the one before. The first that
+    fills WELL_PACKED of the square is taken. Where a set falls short of that by n times _MAX_STEP_GAIN, the next n sets
+    are passed over. A later set is better only if it gains more than the seams it adds are worth.
     """
     best, best_count, skipped, skip = BestCut(0, 0.0, [], 0), 0, 0, 0
     known: dict[tuple[int, int], _KnownChart] = {}
@@ -99,12 +105,13 @@ def pack(
     orders: list[PlacementOrder] | None = None,
     until: float = np.inf,
 ) -> tuple[list[np.ndarray], float]:
-    """Pack charts into the smallest square: their uv (v, 2) in [0, 1], v up, and their scale (uv per unit of surface).
+    """Pack charts into the smallest square.
 
     charts: uv at the scale of the surface, and triangles. gap: smallest distance between charts, and half of it to the
     border, in uv. Orders and weights are tried on a coarse grid, and the best layouts are compacted on a fine one.
-    orders: those of choose_cut(), to start from. until: when the search stops, on the clock time.monotonic; where
-    nothing is found by then the charts stand in rows.
+    orders: those of choose_cut(), to start from. until: when the search stops, on the clock time.monotonic. If it has
+    found nothing by then, the charts are placed in rows. Returns the uv (v, 2) of each chart in [0, 1], v up, and their
+    scale (uv per unit of surface).
     """
     if time.monotonic() > until:
         return _shelf_pack([uv - uv.min(0) for uv, _ in charts], gap)
@@ -140,7 +147,10 @@ def pack(
 
 
 class _KnownChart(NamedTuple):
-    """An oriented chart with its area, and the input, which is kept so that the ids of its arrays stay taken."""
+    """An oriented chart, its area, and the uv and triangles it was made of.
+
+    These are kept so that no other array gets their id(), which is the key of the cache.
+    """
 
     source: tuple[np.ndarray, np.ndarray]
     chart: OrientedChart
@@ -150,9 +160,9 @@ class _KnownChart(NamedTuple):
 def _orient_charts(
     charts: list[tuple[np.ndarray, np.ndarray]], known: dict[tuple[int, int], _KnownChart] | None = None
 ) -> tuple[list[OrientedChart], float]:
-    """Orient charts (uv, triangles) upright, and return them with their total area.
+    """Orient charts (uv, triangles) upright; return them with their total area.
 
-    known: caches charts that come again, by the ids of their arrays.
+    known: caches charts that occur again, by the ids of their arrays.
     """
     known, oriented = {} if known is None else known, []
     for uv, triangles in charts:
@@ -164,7 +174,7 @@ def _orient_charts(
 
 
 def _oriented(uv: np.ndarray, triangles: np.ndarray) -> tuple[OrientedChart, float]:
-    """Return a chart with triangles (t, 3) set upright, and its area."""
+    """Set a chart with triangles (t, 3) upright; return it and its area."""
     uv = orient_upright(uv)
     (a, b) = (uv[triangles[:, 1]] - uv[triangles[:, 0]]).T
     (c, d) = (uv[triangles[:, 2]] - uv[triangles[:, 0]]).T
@@ -179,10 +189,11 @@ def _draft_layouts(
     orders: list[PlacementOrder],
     until: float = np.inf,
 ) -> tuple[int, ChartMasks | None, list[Layout]]:
-    """Place the charts on a coarse grid in a few orders, or in the given ones.
+    """Place the charts on a coarse grid in a few orders, or in the given orders.
 
-    share: of a cell that a chart has to cover for the cell to count. Returns the cells along the side of a square that
-    the charts fill to _DENSITY, their masks on that grid, and the layouts, best first.
+    area: of all charts, in units of surface. gap: between charts, in uv. share: of a cell that a chart has to cover for
+    the cell to count. Returns the cells along the side of a square that the charts fill to _DENSITY, their masks on
+    that grid, and the layouts, best first.
     """
     cells = next(cells for most, cells in _COARSE_CELLS if len(charts) <= most)
     masks = None
@@ -202,21 +213,27 @@ def _draft_layouts(
 
 
 def _improve_layouts(masks: ChartMasks, layouts: list[Layout], max_placed: int, until: float) -> list[Layout]:
-    """Return the layouts and better ones, best first, found by small changes of the best order.
+    """Add better layouts, found by small changes of the best order; return all, best first.
 
-    Several chains are followed, because each soon ends where no small change helps. max_placed: charts placed in all.
+    Several chains of changes are followed, because each soon ends where no small change helps. max_placed: charts
+    placed in all.
     """
     if not layouts or max_placed < _CHAINS * len(layouts[0].order):
         return layouts
     tries = max_placed // len(layouts[0].order) // _CHAINS
-    seeds = sorted(range(_CHAINS), key=lambda seed: seed % 2)  # of layouts of one size the first chain's is taken
+    seeds = sorted(
+        range(_CHAINS), key=lambda seed: seed % 2
+    )  # where layouts are equally large, the first chain's is taken
     more = [layout for seed in seeds for layout in _improvement_chain(masks, layouts[0], tries, seed, until)]
     return sorted(layouts + more, key=lambda layout: layout.side)
 
 
 def _improvement_chain(masks: ChartMasks, best: Layout, tries: int, seed: int, until: float) -> list[Layout]:
-    """Find ever smaller layouts by moving a few charts in the order of the best so far, again and again."""
-    rng, found = np.random.default_rng(seed), []  # fixed seeds: equal input gives equal output
+    """Find ever smaller layouts: move a few charts in the best order so far, and place all again.
+
+    tries: the number of changed orders. until: when the search stops, on the clock time.monotonic.
+    """
+    rng, layouts = np.random.default_rng(seed), []  # fixed seeds: equal input gives equal output
     known: dict[tuple[int, float], dict] = {}
     for _ in range(tries):
         if time.monotonic() > until:
@@ -236,8 +253,8 @@ def _improvement_chain(masks: ChartMasks, best: Layout, tries: int, seed: int, u
         )
         if layout is not None:
             best = layout
-            found.append(layout)
-    return found
+            layouts.append(layout)
+    return layouts
 
 
 def _place_in_order(
@@ -249,13 +266,14 @@ def _place_in_order(
     known: dict | None = None,
     caches_meetings: bool = False,
 ) -> Layout | None:
-    """Place charts one by one in a square of `side` cells, which grows up to max_side where one finds no room.
+    """Place charts one by one in a square of `side` cells, which grows up to max_side where a chart finds no room.
 
-    known: {chart: (its placement, known of the charts placed behind it)}, kept between orders for one side and weight
-    of contact. caches_meetings: charts are placed so often that it pays to cache where two of them meet. Returns None
-    where the square would grow too large, or the time is over.
+    known: {chart: (its placement, known of the charts placed after it)}, kept between orders for one side and weight of
+    contact. caches_meetings: whether charts are placed so often that it pays to cache where two of them overlap.
+    Returns None where the square would grow too large, or the time is over.
     """
-    taken, at, others = 0, [Placement(0, 0, 0)] * len(order.order), []
+    taken, at = 0, [Placement(0, 0, 0)] * len(order.order)
+    others: list[tuple[int, Placement]] = []
     border, after = masks.border(side), {} if known is None else known
     for i in order.order:
         neighbours = others if caches_meetings else None
@@ -278,7 +296,7 @@ def _place_in_order(
 
 
 def _initial_orders(masks: ChartMasks) -> list[PlacementOrder]:
-    """Return orders to place the charts in, largest first by area and by side, with several weights of contact."""
+    """Make orders to place the charts in, largest first by area and by side, with several weights of contact."""
     shape = np.array([of_turn[0] for of_turn in masks.shapes])
     return [
         PlacementOrder(np.argsort(-rank, kind="stable").tolist(), contact)
@@ -288,7 +306,10 @@ def _initial_orders(masks: ChartMasks) -> list[PlacementOrder]:
 
 
 def _shelf_pack(charts: list[np.ndarray], gap: float) -> tuple[list[np.ndarray], float]:
-    """Place the bounding rectangles of charts in rows; for any number of charts, uv (v, 2) from the origin on."""
+    """Place the bounding rectangles of charts in rows; return the charts' uv (v, 2), from the origin on.
+
+    This serves any number of charts.
+    """
     span = np.array([uv.max(0) for uv in charts])
     order = np.argsort(-span[:, 1], kind="stable")
     gap = min(gap, 0.2 / len(charts) ** 0.5)

@@ -1,4 +1,4 @@
-"""Flatten one chart: a conformal map first, then as isometric as possible; never folded, never mirrored."""
+"""Flatten one chart: start with a conformal map, then make it as isometric as possible; never fold or mirror it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MIN_FACING_COSINE = 0.3  # between the mean normal and those of triangles that 
 
 
 class FlattenResult(NamedTuple):
-    """uv (v, 2), or None and the reason why the chart has to be cut.
+    """The coordinates uv (v, 2) of a flat chart, or None and the reason why the chart has to be cut.
 
     overlapped (v, 2): the coordinates of a chart that overlaps itself.
     """
@@ -32,9 +32,9 @@ class FlattenResult(NamedTuple):
 def flatten(mesh: TriMesh, good_stretch: float, max_stretch: float) -> FlattenResult:
     """Flatten one connected chart, a manifold with boundary, to uv (v, 2), v up, at the scale of the surface.
 
-    Least-squares conformal map (Lévy et al. 2002), or
-    Tutte's embedding where that folds, then SLIM (Rabinovich et al. 2017) on the symmetric Dirichlet energy until
-    good_stretch is reached. A chart beyond max_stretch has to be cut.
+    It starts from the least-squares conformal map (Lévy et al. 2002), or from Tutte's embedding where that folds. SLIM
+    (Rabinovich et al. 2017) then lowers the symmetric Dirichlet energy until good_stretch is reached. A chart beyond
+    max_stretch has to be cut.
     """
     triangles = mesh.faces
     edges = edges_of(triangles)
@@ -64,31 +64,31 @@ def flatten(mesh: TriMesh, good_stretch: float, max_stretch: float) -> FlattenRe
 
 
 def is_disk(mesh: TriMesh, edges: Edges) -> bool:
-    """Whether a connected mesh with these edges, which uses all its vertices, is a disk."""
+    """Return whether a connected mesh with these edges, which uses all its vertices, is a disk."""
     return len(mesh.vertices) - len(edges.ends) + len(mesh.faces) == 1 and edges.count.max() == 2
 
 
 def _areas(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return (t,) signed areas of triangles in uv (v, 2)."""
+    """Compute the signed areas (t,) of triangles in uv (v, 2)."""
     a, b, c = (uv[triangles[:, i]] for i in range(3))
     return ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
 
 
 def is_unfolded(uv: np.ndarray, triangles: np.ndarray) -> bool:
-    """Whether all triangles (t, 3) in uv (v, 2) are counter-clockwise and have an area."""
+    """Return whether all triangles (t, 3) in uv (v, 2) are counter-clockwise and have an area."""
     area = _areas(uv, triangles)
     return bool(np.isfinite(area).all() and (area > 1e-10 * max(area.max(initial=0), 1e-300)).all())
 
 
 def _scaled(uv: np.ndarray, triangles: np.ndarray, area: np.ndarray) -> np.ndarray:
-    """Centre uv (v, 2) and scale it so that its area is that of the triangles (t, 3), area (t,)."""
+    """Centre uv (v, 2) and scale it so that the area of its triangles (t, 3) is the sum of area (t,)."""
     return (uv - uv.mean(0)) * (area.sum() / max(_areas(uv, triangles).sum(), 1e-300)) ** 0.5
 
 
 def project_to_plane(mesh: TriMesh) -> np.ndarray | None:
-    """Project a chart along its mean normal; exact for flat charts.
+    """Project a chart along its mean normal; this is exact for flat charts.
 
-    None unless all of it faces that way and nothing overlaps.
+    Returns None where a triangle turns away from the mean normal or the projection overlaps itself.
     """
     triangles = mesh.faces
     uv = _view_along_normal(mesh)
@@ -96,7 +96,7 @@ def project_to_plane(mesh: TriMesh) -> np.ndarray | None:
 
 
 def _view_along_normal(mesh: TriMesh) -> np.ndarray | None:
-    """Return the chart seen along its mean normal, at the scale of the surface; None where a triangle turns away."""
+    """Project a chart along its mean normal, at the scale of the surface; None where a triangle turns away."""
     vertices, triangles = mesh.vertices, mesh.faces
     normals, area = face_normals(mesh)
     mean = (normals * area[:, None]).sum(0)
@@ -113,7 +113,7 @@ def _view_along_normal(mesh: TriMesh) -> np.ndarray | None:
 
 
 def _conformal(mesh: TriMesh, border: np.ndarray) -> np.ndarray | None:
-    """Return the least-squares conformal map, None where it fails.
+    """Compute the least-squares conformal map of a chart, None where that fails.
 
     Two far vertices of the boundary, border (b, 2) edges, are pinned.
     """
@@ -142,9 +142,10 @@ def _conformal(mesh: TriMesh, border: np.ndarray) -> np.ndarray | None:
 
 
 def extend_conformally(mesh: TriMesh, uv: np.ndarray) -> np.ndarray | None:
-    """Extend uv (v, 2) to its non-finite rows by the least-squares conformal map that keeps the finite ones.
+    """Fill the non-finite rows of uv (v, 2) by the least-squares conformal map that keeps the finite rows.
 
-    Only vertices that triangles use are filled. None where fewer than two of them are given, or they have no area.
+    Only vertices that triangles use are filled. Returns None where fewer than two rows are finite, or they have no
+    area.
     """
     vertices, triangles = mesh.vertices, mesh.faces
     igl = imported("igl")
@@ -170,8 +171,9 @@ def extend_conformally(mesh: TriMesh, uv: np.ndarray) -> np.ndarray | None:
 
 
 def _tutte(mesh: TriMesh) -> np.ndarray | None:
-    """Return the uniform-weight embedding onto a circle (Tutte 1963), which never folds; None unless it has one
-    boundary.
+    """Compute the uniform-weight embedding onto a circle (Tutte 1963), which never folds.
+
+    Returns None unless the chart has exactly one boundary.
     """
     vertices, triangles = mesh.vertices, mesh.faces
     from scipy.sparse import coo_matrix, diags
@@ -236,7 +238,10 @@ def _isometric(
 
 
 def singular_values(mesh: TriMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (t, 2) singular values, larger first, of the map from uv to the surface, and areas (t,)."""
+    """Compute the singular values (t, 2), larger first, of the map from uv to the surface, and the areas (t,).
+
+    The areas are those of the triangles on the surface.
+    """
     vertices, triangles = mesh.vertices, mesh.faces
     e1, e2 = (
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]],
@@ -254,12 +259,12 @@ def singular_values(mesh: TriMesh, uv: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def stretch(mesh: TriMesh, uv: np.ndarray) -> float:
-    """Return the L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
+    """Compute the L2 stretch (Sander et al. 2001), 1 for an isometry, at the scale where the areas agree."""
     return StretchMeasure(mesh).stretch(uv)
 
 
 class StretchMeasure:
-    """Measures the stretch of maps of a mesh to the plane; what all maps share is computed once."""
+    """A measure of the stretch of maps from one mesh to the plane; the parts that all maps share are computed once."""
 
     def __init__(self, mesh: TriMesh):
         vertices = mesh.vertices
@@ -271,7 +276,7 @@ class StretchMeasure:
         self.area = np.sqrt((normal * normal).sum(0)) / 2
 
     def squared(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (t,) the mean square of the two singular values of the map from uv (v, 2) to each triangle.
+        """Compute the mean square (t,) of the two singular values of the map from uv (v, 2) to each triangle.
 
         Also returns the triangles' areas (t,) in uv, not negative.
         """
@@ -283,11 +288,11 @@ class StretchMeasure:
         ), flat / 2
 
     def at_scale(self, uv: np.ndarray) -> float:
-        """Return the L2 stretch with one unit of uv as one of the surface: below 1 where uv is larger."""
+        """Compute the L2 stretch with one unit of uv as one of the surface: below 1 where uv is larger."""
         return float(np.sqrt((self.area * self.squared(uv)[0]).sum() / max(self.area.sum(), 1e-300)))
 
     def stretch(self, uv: np.ndarray) -> float:
-        """Return the L2 stretch at the scale where the areas agree; infinite where nothing has an area."""
+        """Compute the L2 stretch at the scale where the areas agree; infinite where nothing has an area."""
         square, flat = self.squared(uv)
         area, total = self.area, self.area.sum()
         use = (area > 1e-12 * total) & (flat > 1e-14 * max(flat.sum(), 1e-300))
@@ -297,7 +302,7 @@ class StretchMeasure:
 
 
 def overlaps_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: bool) -> bool:
-    """Whether some part of the chart lies on another; quicker than overlapping_triangles().
+    """Return whether some part of the chart lies on another; quicker than overlapping_triangles().
 
     A disk whose boundary neither crosses nor touches itself overlaps nothing: its boundary winds around everything
     once.
@@ -306,13 +311,14 @@ def overlaps_itself(uv: np.ndarray, triangles: np.ndarray, edges: Edges, disk: b
         return True
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     crossing, touches = rim_crossings(uv, edges.half_ends[rim])
-    return len(crossing) > 0 or (touches or not disk) and bool((_covered(uv, triangles)[2] > 1).any())
+    return len(crossing) > 0 or (touches or not disk) and bool((_rasterised(uv, triangles)[2] > 1).any())
 
 
-def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+def _rasterised(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
     """Rasterise a chart on a grid finer than its triangles.
 
-    Returns uv (v, 2) in the unit square, the grid's size, and (size, size) how many triangles own each texel.
+    Returns uv (v, 2) scaled to the unit square, the grid's size, and (size, size) the number of triangles over each
+    texel.
     """
     size = int(np.clip(10 * len(triangles) ** 0.5, 64, 512))
     at = (uv - uv.min(0)) / np.ptp(uv, 0).max()
@@ -320,7 +326,7 @@ def _covered(uv: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, int, np
 
 
 def overlapping_triangles(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return (t,) bool: the triangles of an unfolded chart that lie on others of it.
+    """Mark the triangles of an unfolded chart that lie on others of it, (t,) bool.
 
     The boundary of such a chart crosses itself, however little, or winds around some texels twice, which the grid
     finds.
@@ -331,7 +337,7 @@ def overlapping_triangles(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     edges = edges_of(triangles)
     rim = np.flatnonzero(edges.count[edges.half_edge_idx] == 1)
     overlaps[edges.half_face[rim[rim_crossings(uv, edges.half_ends[rim])[0]]]] = True
-    at, size, count = _covered(uv, triangles)
+    at, size, count = _rasterised(uv, triangles)
     twice = count > 1
     if twice.any():
         for face_idx, row, column in owned_texels(at, triangles, size):
@@ -340,11 +346,11 @@ def overlapping_triangles(uv: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) -> tuple[np.ndarray, bool]:
-    """Find boundary segments that cross another segment with which they share no end.
+    """Find the boundary segments that cross another segment with which they share no end.
 
-    ends (s, 2) into points uv (v, 2). Sweep over u, exact to rounding; at_once bounds the pairs compared at a time.
-    Returns the crossing segments (n,), and whether any touch: where the ends of two lie in one place, as at a cut, they
-    may cross there or only touch.
+    ends (s, 2): segments between points uv (v, 2). A sweep over u, exact to rounding; at_once bounds the pairs compared
+    at a time. Returns the crossing segments (n,), and whether any touch. Segments touch where ends of two lie in one
+    place, as at a cut; whether they also cross there is not determined.
     """
     low, high = uv[ends].min(1), uv[ends].max(1)
     order = np.argsort(low[:, 0], kind="stable")
@@ -376,5 +382,5 @@ def rim_crossings(uv: np.ndarray, ends: np.ndarray, at_once: int = 2_000_000) ->
 
 
 def _orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return on which side of the line from a to b the point c lies, each (n, 2): -1, 0 or 1."""
+    """Compute the side of the line from a to b that the point c lies on, each (n, 2): -1, 0 or 1."""
     return np.sign((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])

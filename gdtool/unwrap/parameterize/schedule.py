@@ -1,4 +1,4 @@
-"""Flatten all charts of a mesh: merge small ones, remove overlaps, and cut what does not lie flat or stretches."""
+"""Flatten all charts of a mesh: merge small ones, remove overlaps, cut those that do not lie flat or stretch much."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LATE = "was left when the time was over"
 
 @dataclass(frozen=True)
 class FlattenLimits:
-    """When a chart is good enough, when it is cut, and when simpler ways take over.
+    """Limits of stretch, and the times from which simpler methods are used.
 
     good_stretch: L2 stretch at which flattening stops; max_stretch: beyond which a chart is cut. project_after: time
     (time.monotonic) from which the remaining charts are only projected to a plane; single_after: time from which each
@@ -44,20 +44,20 @@ class FlattenLimits:
 
 @dataclass
 class ParameterizedCharts:
-    """Flat charts, the pieces removed from them, and how many charts were cut for each reason."""
+    """Flat charts, the pieces removed from them, and the number of charts that were cut, by reason."""
 
     charts: list[Chart] = field(default_factory=list)
     removed: list[OverlapPiece] = field(default_factory=list)
     cut: Counter = field(default_factory=Counter)
 
     def add(self, other: ParameterizedCharts) -> None:
-        """Append the charts, pieces and counts of another."""
+        """Append the charts, pieces and counts of `other`."""
         self.charts += other.charts
         self.removed += other.removed
         self.cut += other.cut
 
     def reasons(self) -> list[str]:
-        """Return one sentence for each reason to cut charts."""
+        """Write one sentence for each reason to cut charts."""
         return [f"{count} charts were cut: a chart {reason}" for reason, count in self.cut.items()]
 
 
@@ -65,8 +65,8 @@ class ParameterizedCharts:
 class LabelledMesh:
     """The mesh whose charts are flattened.
 
-    mesh: with a vertex for each fan of faces. label (f,): the chart of each face before merging. part (f,): faces that
-    stay together where a chart is cut, if they can.
+    mesh: a mesh in which each vertex has one fan of faces. label (f,): the chart of each face before merging. part
+    (f,): the part of its chart; where a chart is cut, faces of one part stay together if possible.
     """
 
     adjacency: Adjacency
@@ -85,7 +85,7 @@ def flatten_all(
     """Flatten each chart of a mesh, label (f,) of its faces; return the charts and a sentence for each reason to cut.
 
     proxy: a coarse mesh of the surface, on which merging is tried. Without one nothing is merged, and charts are only
-    projected to a plane and cut until that works. part (f,): see LabelledMesh.
+    projected to a plane and cut until all are flat. part (f,): see LabelledMesh.
     """
     adjacency = Adjacency(mesh)
     labelled = LabelledMesh(adjacency, one_vertex_per_fan(mesh), label, label if part is None else part)
@@ -114,8 +114,9 @@ def parameterize(
 ) -> ParameterizedCharts:
     """Flatten sets of faces, and cut those that do not lie flat.
 
-    A merged set of several labels may stretch less than a single one, and is taken apart first. removes_overlaps: where
-    little of a chart lies on other parts of it, only that is removed. project_only: projection to a plane alone.
+    A set merged of several labels may stretch less than a set of one label. Where it stretches more, it is first split
+    by label again. removes_overlaps: where little of a chart lies on other parts of it, only that is removed.
+    project_only: flatten by projection to a plane alone.
     """
     flat, queue = ParameterizedCharts(), sets[::-1]
     while queue:
@@ -156,15 +157,15 @@ def parameterize(
 
 
 def _flatten_set(mesh: TriMesh, limits: FlattenLimits, is_merged: bool, project_only: bool) -> FlattenResult:
-    """Flatten one set of triangles, by projection alone or within the stretch that it may have."""
+    """Flatten one set of triangles: by projection alone, or within the stretch that a single or merged set may have."""
     if project_only:
         return FlattenResult(project_to_plane(mesh), "is not flat")
     max_stretch = merged_stretch_limit(limits.good_stretch) if is_merged else limits.max_stretch
     return flatten(TriMesh(mesh.vertices, mesh.faces.astype(np.int64)), limits.good_stretch, max_stretch)
 
 
-def _excess(labelled: LabelledMesh, chart: Chart) -> float:
-    """Return a chart's area times the excess of its squared stretch over 1."""
+def _stretch_excess(labelled: LabelledMesh, chart: Chart) -> float:
+    """Compute a chart's area times the excess of its squared stretch over 1."""
     points = np.zeros((len(chart.uv), 3))
     used = chart.corners >= 0
     mesh = labelled.mesh
@@ -174,20 +175,22 @@ def _excess(labelled: LabelledMesh, chart: Chart) -> float:
 
 
 def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limits: FlattenLimits) -> None:
-    """Cut the charts that make all charts together stretch too much, in place, the worst first.
+    """Cut the charts that stretch most until all charts together stretch little enough; changes `flat`.
 
-    The square of the stretch of the whole is the mean of the charts' squares by area, because each chart is at the
+    The squared stretch of the whole is the mean of the charts' squared stretches by area, because each chart is at the
     scale of the surface.
     """
     max_cut = _MAX_CUT + int(_MAX_CUT_SHARE * len(flat.charts))
     allowed = ((1 + _MAX_TOTAL_EXCESS * (limits.good_stretch - 1)) ** 2 - 1) * float(labelled.adjacency.area.sum())
-    values = [_excess(labelled, chart) for chart in flat.charts]
-    total, gone = sum(values), set()
+    values = [_stretch_excess(labelled, chart) for chart in flat.charts]
+    total = sum(values)
+    gone: set[int] = set()
     queue = [(-value, i) for i, value in enumerate(values) if value > 0 and len(flat.charts[i].faces_idx) > 1]
     heapq.heapify(queue)
     while total > allowed and len(gone) < max_cut and queue:
         # Cut at once all charts that have to be cut even if the parts of the worse ones do not stretch at all.
-        worst, rest = [], total
+        worst: list[tuple[float, int]] = []
+        rest = total
         while rest > allowed and len(gone) + len(worst) < max_cut and queue:
             worst.append(heapq.heappop(queue))
             rest += worst[-1][0]
@@ -196,7 +199,7 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
             half for _, i in worst for half in _split_set(labelled.adjacency, labelled.part, flat.charts[i].faces_idx)
         ]
         halves = parameterize(labelled, sets, limits)
-        values = [_excess(labelled, chart) for chart in halves.charts]
+        values = [_stretch_excess(labelled, chart) for chart in halves.charts]
         total = rest + sum(values)
         for i, value in enumerate(values):
             if value > 0 and len(halves.charts[i].faces_idx) > 1:
@@ -207,9 +210,10 @@ def _cut_most_stretched(labelled: LabelledMesh, flat: ParameterizedCharts, limit
 
 
 def _split_set(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) -> list[np.ndarray]:
-    """Split a chart's faces into two or more connected sets, between its parts where it has several.
+    """Split a chart's faces into two or more connected sets, along the borders of its parts where it has several.
 
-    part (f,): seams between parts begin and end at creases.
+    part (f,): the part of its chart that each face is in (Segmentation.part). Seams between parts begin and end at
+    creases.
     """
     half, area = split_in_half(adjacency, faces_idx), adjacency.area[faces_idx]
     if half.all() or not half.any():
@@ -224,13 +228,13 @@ def _split_set(adjacency: Adjacency, part: np.ndarray, faces_idx: np.ndarray) ->
 
 
 def _faces_by_label(label: np.ndarray) -> list[np.ndarray]:
-    """Return the indices of each label, in the order of the labels."""
+    """List the indices of the faces of each label, in the order of the labels."""
     order = np.argsort(label, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _one_chart_per_face(mesh: QuadMesh, faces_idx: np.ndarray) -> list[Chart]:
-    """Make each of some faces (k,) a chart, seen along its normal.
+    """Make each of some faces (k,) a chart, projected along its normal.
 
     A face that folds this way becomes a square or right triangle of its size.
     """
@@ -252,7 +256,7 @@ def _one_chart_per_face(mesh: QuadMesh, faces_idx: np.ndarray) -> list[Chart]:
 
 
 def _square_or_triangle(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return a square or right triangle (c, 2) of the size of a face that has no area or folds."""
+    """Make a square or right triangle (c, 2) of the size of a face that has no area or folds."""
     used = corners[corners >= 0]
     size = max(float(np.ptp(points, 0).max()), 1e-6)
     uv = np.zeros((len(points), 2))

@@ -1,4 +1,7 @@
-"""Segment a quad mesh into charts: run xatlas on a simplified proxy, transfer its charts to whole quads, tidy them."""
+"""Segment a quad mesh into charts.
+
+xatlas runs on a simplified proxy. Its charts are transferred to the quads, and their borders smoothed.
+"""
 
 from __future__ import annotations
 
@@ -22,16 +25,16 @@ _CREASE_COST = 0.1  # ... where a seam costs this share of its length
 _MIN_CHILD_SECONDS, _CHILD_MEMORY_MB = 0.05, 8000
 _MIN_CHART_SHARE = 0.003  # of the area: a smaller chart merges with a neighbour if it has one
 _MIN_CHART_FACES = 8  # so does a chart of fewer faces, or of one in 64 of a small mesh
-# What a face adds to the vote for its own label, in typical edge costs: for its first label, and for one it took on.
+# Bonus in a face's vote for the label that it has, in typical edge costs: its first label, and one that it took on.
 _FIRST_BONUS, _LATER_BONUS = 0.4, 0.1
 _MAX_MERGES = 20  # rounds of merging small charts
 _CREASE_FACTOR = 5.0  # times longer is the way across a crease, so that halves part there
 
 
 def run_xatlas(mesh: TriMesh, max_cost: float) -> np.ndarray:
-    """Return (t,) the chart of each triangle by xatlas, -1 for triangles that it drops.
+    """Find the chart (t,) of each triangle by xatlas, -1 for triangles that it drops.
 
-    Runs in a child process, because xatlas can hang.
+    Runs in a child process, because xatlas can hang. max_cost: xatlas' limit on a chart's cost.
     """
     vertices, triangles = mesh.vertices, mesh.faces
     xatlas = imported("xatlas")
@@ -49,10 +52,10 @@ def run_xatlas(mesh: TriMesh, max_cost: float) -> np.ndarray:
 
 
 class Adjacency:
-    """Pairs of faces that share an edge, and what a seam along that edge costs.
+    """Pairs of faces that share an edge, and the cost of a seam along that edge.
 
     pairs (k, 2); cost (k,): the edge's length, a tenth of it on creases; crease (k,) bool; ends (k, 2) the edge's
-    vertices. area (f,) and normals (f, 3) of the faces; count of the faces.
+    vertices. area (f,) and normals (f, 3) of the faces; count: the number of faces.
     """
 
     def __init__(self, mesh: QuadMesh):
@@ -75,7 +78,7 @@ class Adjacency:
         self._begin = np.searchsorted(self.pairs[:, 0], np.arange(self.count + 1))
 
     def within(self, faces_idx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the rows (r,) of pairs whose faces are both among faces_idx (k,), and their indices (r, 2) there."""
+        """Find the rows (r,) of pairs whose faces are both among faces_idx (k,), and their indices (r, 2) in it."""
         first, number = self._begin[faces_idx], self._begin[faces_idx + 1] - self._begin[faces_idx]
         rows = np.repeat(first - np.cumsum(number) + number, number) + np.arange(number.sum())
         place = np.full(self.count, -1)
@@ -85,7 +88,7 @@ class Adjacency:
         return rows[inside], pairs[inside]
 
     def connected_sets(self, faces_idx: np.ndarray, side: np.ndarray | None = None) -> np.ndarray:
-        """Number the connected sets of faces_idx (k,), from 0 on; return (k,) the number of each face.
+        """Find the connected set (k,), numbered from 0 on, that each of faces_idx (k,) belongs to.
 
         side (k,): faces of different sides are not connected.
         """
@@ -100,7 +103,7 @@ class Adjacency:
         )[1]
 
     def connected_labels(self, label: np.ndarray) -> np.ndarray:
-        """Return labels (f,) in which each connected set of faces of one label has a label of its own."""
+        """Split labels (f,) until the faces of each label are connected."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
 
@@ -110,7 +113,7 @@ class Adjacency:
         return connected_components(graph, False)[1].astype(np.int64)
 
     def votes(self, label: np.ndarray, bonus: np.ndarray | float) -> np.ndarray:
-        """Return (f,) the label around each face whose edges would cost most to cut.
+        """Find for each face the label (f,) around it whose shared edges would cost most to cut.
 
         bonus (f,): added to the label that the face has.
         """
@@ -137,8 +140,8 @@ class Adjacency:
 class Segmentation(NamedTuple):
     """Charts of a mesh.
 
-    label (f,): the connected chart of each face; part (f,): the part of its chart, a candidate for cutting; proxy: the
-    coarse mesh that charts were found on; failed: sentences on what failed on the way.
+    label (f,): the connected chart of each face; part (f,): the part of its chart, along whose borders a chart is cut
+    if need be; proxy: the coarse mesh that charts were found on; failed: sentences on steps that failed.
     """
 
     label: np.ndarray
@@ -148,10 +151,10 @@ class Segmentation(NamedTuple):
 
 
 def find_charts(adjacency: Callable[[], Adjacency], mesh: QuadMesh, *, until: float, max_cost: float) -> Segmentation:
-    """Segment a mesh into charts, with xatlas or, where it fails, by the box side that faces look at.
+    """Segment a mesh into charts, with xatlas or, where that fails, by the side of a box that faces look at.
 
-    mesh: in a unit box. adjacency: returns that of its faces. until: when xatlas is given up, on the clock
-    time.monotonic. max_cost: xatlas' limit on the cost of a chart.
+    mesh: in a unit box. adjacency: a function that returns the Adjacency of its faces. until: when xatlas is given up,
+    on the clock time.monotonic. max_cost: xatlas' limit on the cost of a chart.
     """
     from gdtool.geometry.distance import closest_points
     from gdtool.geometry.simplify import SimplifyOptions, simplify
@@ -188,9 +191,9 @@ def find_charts(adjacency: Callable[[], Adjacency], mesh: QuadMesh, *, until: fl
 
 
 def chart_mesh(mesh: Mesh) -> Mesh:
-    """Return a chart's faces with vertices of their own, doubled where the chart touches itself.
+    """Make a mesh of a chart's faces alone; a vertex in which the chart touches itself is doubled.
 
-    mesh: some faces of a mesh in which each vertex has one fan of faces; its other vertices are left out.
+    mesh: some faces of a mesh in which each vertex has one fan of faces; vertices of other faces are left out.
     """
     vertices, faces = mesh.vertices, mesh.faces
     used, corners = faces >= 0, np.full(faces.shape, -1, np.int64)
@@ -220,8 +223,8 @@ def chart_mesh(mesh: Mesh) -> Mesh:
 def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Smooth the seams between labels, prefer creases, and merge islands too small for a chart.
 
-    Returns labels (f,), and the labels from when each island had merged with one neighbour: the parts that charts are
-    made of.
+    Returns the labels (f,), and the parts (f,) that charts are made of: the labels after each small island had merged
+    once.
     """
     first = label
     typical = np.median(adjacency.cost) if len(adjacency.cost) else 0.0
@@ -244,11 +247,11 @@ def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tu
         apart = a != b
         pair = np.concatenate([np.stack([a, b], -1)[apart], np.stack([b, a], -1)[apart]])
         weight = np.concatenate([adjacency.cost[apart]] * 2)
-        mine = small[pair[:, 0]]
-        if not mine.any():
+        from_small = small[pair[:, 0]]
+        if not from_small.any():
             break
-        key, inverse = np.unique(pair[mine][:, 0] * len(area) + pair[mine][:, 1], return_inverse=True)
-        total = np.bincount(inverse.ravel(), weight[mine])
+        key, inverse = np.unique(pair[from_small][:, 0] * len(area) + pair[from_small][:, 1], return_inverse=True)
+        total = np.bincount(inverse.ravel(), weight[from_small])
         merged_into = np.arange(len(area))
         for k in np.argsort(total, kind="stable").tolist():
             merged_into[key[k] // len(area)] = key[k] % len(area)
@@ -262,7 +265,7 @@ def tidy_labels(adjacency: Adjacency, label: np.ndarray, rounds: int = 12) -> tu
 
 
 def split_in_half(adjacency: Adjacency, faces_idx: np.ndarray) -> np.ndarray:
-    """Split a chart's faces (k,) into two connected halves, between two faces far from each other; return (k,) bool."""
+    """Split a chart's faces (k,) into two connected halves, around two faces far from each other; return (k,) bool."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
 

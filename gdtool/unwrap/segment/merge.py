@@ -1,4 +1,4 @@
-"""Merge small charts with neighbours that they lie flat with; tried on a coarse proxy of the surface."""
+"""Merge small charts with neighbours if the two lie flat together, as tried on a coarse proxy of the surface."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SMALL_SHARE = 0.02  # of the area: charts smaller than this are merged
 
 
 def merged_stretch_limit(good_stretch: float) -> float:
-    """Return how much a chart merged from two may stretch, where good_stretch is good for one."""
+    """Compute the L2 stretch allowed for a chart merged from two, where good_stretch is good for one."""
     return 1 + 2 * (good_stretch - 1)
 
 
@@ -27,7 +27,7 @@ def merge_small_charts(
 ) -> np.ndarray:
     """Merge small charts into the neighbour with the longest common seam, where the two lie flat together.
 
-    That is tried on proxy_mesh, a coarse mesh of the same surface. Returns labels (f,) of the mesh's faces.
+    Both are flattened on proxy_mesh, a coarse mesh of the same surface. Returns labels (f,) of the mesh's faces.
     """
     proxy_mesh = one_vertex_per_fan(proxy_mesh)
     proxy_vertices, proxy = proxy_mesh.vertices, proxy_mesh.faces
@@ -71,9 +71,9 @@ def _transfer_labels(
     proxy_mesh: TriMesh,
     adjacency: Adjacency,
 ) -> np.ndarray:
-    """Return (t,) the label of the nearest face that faces the same way, for each triangle of the proxy.
+    """Find for each triangle of the proxy the label (t,) of the nearest face that faces the same way.
 
-    -1 outside each label's largest connected piece.
+    The label is -1 outside the largest connected piece of each label.
     """
     from scipy.spatial import cKDTree
 

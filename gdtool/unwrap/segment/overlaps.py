@@ -29,7 +29,7 @@ _MAX_PIECE_STRETCH = 1.1  # of a piece beside such a chart, at the chart's scale
 
 
 class OverlapPiece(NamedTuple):
-    """Faces (k,) removed from a chart, and a face of that chart, which is not offered them again."""
+    """Faces (k,) removed from a chart, and a face of that chart, which the piece is not offered to again."""
 
     home: int
     faces_idx: np.ndarray
@@ -41,8 +41,9 @@ def remove_overlaps(
     """Choose the faces of a chart to keep so that none lies on another.
 
     faces_idx (k,); triangles (t, 3); face_idx (t,): the row in faces_idx of each triangle's face; overlapped (v, 2):
-    the overlapping coordinates that flatten() returned. Among the overlapping faces the smallest connected set is
-    removed, again and again, until nothing overlaps. Returns (k,) bool, or None where too much would have to go.
+    the overlapping coordinates that flatten() returned. The smallest connected set of overlapping faces is removed,
+    again and again, until nothing overlaps. Returns (k,) bool, or None where more than _MAX_REMOVED_SHARE of the area
+    would go.
     """
     overlaps = overlapping_triangles(overlapped, triangles)
     keep, area = np.ones(len(faces_idx), bool), adjacency.area[faces_idx]
@@ -63,9 +64,9 @@ def give_to_neighbours(
     pieces: list[OverlapPiece],
     good_stretch: float,
 ) -> list[OverlapPiece]:
-    """Add each piece to a neighbouring chart that it lies flat with, in place; return the pieces that fit nowhere.
+    """Add each piece to a neighbouring chart that it lies flat with; return the pieces that fit nowhere.
 
-    Chart and piece together may stretch as much as two merged charts.
+    Changes `charts`. Chart and piece together may stretch as much as two merged charts.
     """
     vertices, faces = mesh.vertices, mesh.faces
     owner, number = np.full((2, adjacency.count), -1)
@@ -76,7 +77,7 @@ def give_to_neighbours(
     sides = number[adjacency.pairs]
     rim = np.flatnonzero(sides[:, 0] != sides[:, 1])
     rows_of = _rows_by_number(sides[rim].T.ravel(), np.tile(rim, 2), len(pieces))
-    left, work = [], 0
+    unplaced, work = [], 0
     by_size = sorted(zip(rows_of, pieces, strict=True), key=lambda pair: len(pair[1].faces_idx), reverse=True)
     for rows, piece in by_size:
         beside = owner[adjacency.pairs[rows]].max(1)  # the piece itself has no owner yet
@@ -98,15 +99,16 @@ def give_to_neighbours(
                 charts[i], owner[piece.faces_idx] = Chart(faces_idx, both.faces, uv, triangles.faces), i
                 break
         else:
-            left.append(piece)
-    return left
+            unplaced.append(piece)
+    return unplaced
 
 
 def _extend_chart(both: QuadMesh, triangles: TriMesh, chart: Chart, max_stretch: float) -> np.ndarray | None:
     """Flatten a piece beside a chart that keeps its coordinates, conformally from their common seam on.
 
-    both: the chart's faces and then the piece's; triangles: the same, triangulated. Returns uv (v, 2), or None where
-    the piece does not lie flat this way, or where it would close a cut of the chart.
+    both: a mesh of the chart's faces and then the piece's; triangles: the same, triangulated. max_stretch: L2, of both
+    together. Returns uv (v, 2), or None where the piece does not lie flat this way, or where it would close a cut of
+    the chart.
     """
     chart_corners = both.faces[: len(chart.corners)][chart.corners >= 0]
     chart_uv = chart.uv[chart.corners[chart.corners >= 0]]

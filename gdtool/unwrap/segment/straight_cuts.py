@@ -23,15 +23,16 @@ _MIN_PART = 0.004  # of all area, that a part has to have
 
 
 def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) -> Iterator[list[Chart]]:
-    """Cut ill-shaped charts along straight lines of their plane, as far as the quads allow.
+    """Cut charts of awkward shape along straight lines in their plane, as far as the quads allow.
 
-    Yields for each of the rising counts a list of about that many charts, until no cut is worth it. First come the cuts
-    for which the smallest rectangles around the charts lose most area for each chart added. Texture coordinates stay:
-    parts of a flat chart are flat.
+    counts: rising numbers of charts. Yields for each of them a list of about that many charts, until no cut is worth
+    it. First come the cuts that save most area for each chart added; the area is that of the smallest rectangles around
+    the charts. Texture coordinates stay: parts of a flat chart are flat.
     """
     total = float(adjacency.area.sum())
     number = itertools.count()  # of equal cuts the earlier comes first
-    whole, queue = [], []
+    whole: list[Chart] = []
+    queue: list[tuple[float, int, _CutCandidate]] = []
 
     def add(piece: _CutCandidate) -> None:
         if piece.rate < _MIN_GAIN * total:
@@ -44,7 +45,9 @@ def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) ->
     for count in counts:
         changed = False
         while queue and len(whole) + len(queue) < count:
-            for part in heapq.heappop(queue)[2].cut[1]:
+            best = heapq.heappop(queue)[2].cut
+            assert best is not None  # without a cut a piece gains nothing, and is not in the queue
+            for part in best[1]:
                 add(part)
             changed = True
         if changed:
@@ -52,25 +55,25 @@ def cut_to_pack(adjacency: Adjacency, charts: list[Chart], counts: list[int]) ->
 
 
 class _CutCandidate:
-    """A chart, and how it would be cut."""
+    """A chart, and its best straight cut."""
 
     def __init__(self, adjacency: Adjacency, chart: Chart, smallest: float):
         self._adjacency, self.chart, self._smallest = adjacency, chart, smallest
 
     @cached_property
     def cut(self) -> tuple[float, list[_CutCandidate]] | None:
-        """The best cut: the area that rectangles lose by it, and its two or three parts; None where no cut will do."""
+        """Find the best cut: the area that rectangles lose by it, and its two or three parts; None without a cut."""
         best = _best_cut(self._adjacency, self.chart, self._smallest)
-        return best and (
-            best[0],
-            [_CutCandidate(self._adjacency, sub_chart(self.chart, half), self._smallest) for half in best[1]],
-        )
+        if best is None:
+            return None
+        area, halves = best
+        return area, [_CutCandidate(self._adjacency, sub_chart(self.chart, half), self._smallest) for half in halves]
 
     @cached_property
     def rate(self) -> float:
-        """The area that rectangles lose for each chart added, by this cut, or by it and the cuts of its parts.
+        """Compute the area that rectangles lose for each chart added, by this cut, or by it and the cuts of its parts.
 
-        The halves of a ring save nothing, their halves do.
+        Cutting a ring in half saves nothing, but cutting its halves does.
         """
         if self.cut is None:
             return -np.inf
@@ -84,7 +87,11 @@ class _CutCandidate:
 
 
 class _Line(NamedTuple):
-    """A straight cut: area of the rectangles around both sides, distance of each face across it, and its offset."""
+    """A straight line across a chart.
+
+    It has the area of the rectangles around both sides, the coordinate of each face across the line, and the line's
+    offset there.
+    """
 
     area: float
     across: np.ndarray
@@ -94,8 +101,8 @@ class _Line(NamedTuple):
 def _best_cut(adjacency: Adjacency, chart: Chart, smallest: float) -> tuple[float, list[np.ndarray]] | None:
     """Find the straight line for which the rectangles around the parts are smallest.
 
-    Returns the area that rectangles lose by the cut, and masks (k,) of the faces of its two or three connected parts;
-    None where no line leaves parts of at least `smallest`.
+    Returns the area that the rectangles lose by the cut, and masks (k,) of the faces of its two or three connected
+    parts; None where every line leaves a part smaller than `smallest`.
     """
     faces_idx, corners, uv, _ = chart
     area = adjacency.area[faces_idx]
@@ -129,10 +136,10 @@ def _best_cut(adjacency: Adjacency, chart: Chart, smallest: float) -> tuple[floa
 
 
 def _connected_sides(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smallest: float) -> np.ndarray:
-    """Return (k,) the connected part of its side that each face is in, numbered from 0 on.
+    """Find the connected part (k,), numbered from 0 on, that each face is in on its side of a line.
 
-    half (k,) bool: the side; pairs (r, 2) of faces share an edge. Parts below `smallest`, which a line leaves along a
-    rim that is not straight, change sides.
+    half (k,) bool: the side; pairs (r, 2) of faces share an edge. Parts with less area than `smallest`, which a line
+    leaves along a rough rim, change sides.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -150,8 +157,9 @@ def _connected_sides(pairs: np.ndarray, half: np.ndarray, area: np.ndarray, smal
 
 
 def _prefix_suffix_spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spans of values (a, n) before each of the rising counts (c,), 0 < count < n, and from it on: (a, c)
-    each.
+    """Compute the spans of the first `count` of values (a, n), and of the others: (a, c) each.
+
+    counts (c,): rising, 0 < count < n.
     """
     first, at = np.unique(np.append(0, counts), return_inverse=True)
     high, low = np.maximum.reduceat(values, first, 1), np.minimum.reduceat(values, first, 1)
@@ -161,20 +169,20 @@ def _prefix_suffix_spans(values: np.ndarray, counts: np.ndarray) -> tuple[np.nda
 
 
 def _rectangle_area(spans: np.ndarray) -> np.ndarray:
-    """Return the area of the smallest rectangle that has spans (angles, ...) along _ANGLES."""
+    """Compute the area of the smallest rectangle that has spans (angles, ...) along the directions _ANGLES."""
     quarter = len(_ANGLES) // 2
     return (spans[:quarter] * spans[quarter:]).min(0)
 
 
 def connected_masks(adjacency: Adjacency, faces_idx: np.ndarray, side: np.ndarray) -> list[np.ndarray]:
-    """Return the connected parts of a side (k,) bool of faces (k,), as masks (k,)."""
+    """Split a side (k,) bool of faces (k,) into its connected parts, as masks (k,)."""
     number = np.full(len(side), -1)
     number[side] = adjacency.connected_sets(faces_idx[side])
     return [number == n for n in range(number.max() + 1)]
 
 
 def sub_chart(chart: Chart, half: np.ndarray) -> Chart:
-    """Return the chart of some faces (k,) bool of a chart; their coordinates stay."""
+    """Make a chart of some faces, half (k,) bool, of a chart; their coordinates stay."""
     faces_idx, corners, uv, _ = chart
     used, local = np.unique(corners[half], return_inverse=True)
     local = local.reshape(-1, 4)
