@@ -1,4 +1,6 @@
-"""Options of the command line: their types, those derived from a stage's Options, and those of every command."""
+"""Define the options of the command line: their types, those derived from a stage's Options, and those of every
+command.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`gdtool evaluate`: measure results against a reference; reports go to stdout."""
+"""Define `gdtool evaluate`: measure results against a reference, and write the reports to stdout."""
 
 from __future__ import annotations
 

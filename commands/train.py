@@ -1,4 +1,7 @@
-"""`gdtool train`: options and help come from the stage; adds --plan, and follows the first process of torchrun."""
+"""Define `gdtool train`; its options and help come from the stage.
+
+It adds --plan. Started by torchrun, the first process runs the command and the others follow it.
+"""
 
 import os
 

@@ -1,4 +1,4 @@
-"""`gdtool validate`: check folders and .glb files against the format."""
+"""Define `gdtool validate`: check folders and .glb files against the format."""
 
 from __future__ import annotations
 

@@ -88,7 +88,9 @@ def camera_at(
 ) -> Camera:
     """Place a camera on a sphere around the origin, looking at it.
 
-    azimuth, elevation: degrees. fov_degrees: across; with it the camera is perspective, else orthographic.
+    azimuth, elevation: degrees; azimuth 0 is on +Z, positive toward +X. size: side of its square image in pixels.
+    distance, half_width: world units. fov_degrees: horizontal field of view of a perspective camera; None for an
+    orthographic one.
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     position = distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
@@ -103,7 +105,10 @@ def camera_at(
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """Make a rig of square cameras: "six", or "wonder3d" with the same azimuths and 1.35 world units across."""
+    """Make the six-view rig: square orthographic cameras of size x size pixels.
+
+    name: "six", or "wonder3d" with the same azimuths and images 1.35 world units across.
+    """
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:
         raise ValueError(f"unknown rig {name!r}; known: {', '.join(half_widths)}")

@@ -41,9 +41,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: int = 1) -> None:
-    """Start `count` children that import the module of `function`, and `modules`, while this process goes on.
+    """Start `count` child processes ahead of time: they import the module of `function`, and `modules`, and wait.
 
-    A later begin() of `function` uses one of them.
+    This process goes on meanwhile. A later begin() of `function` uses one of them.
     """
     module = _module_of(function)
     waiting = _waiting.setdefault(module, [])
@@ -57,9 +57,9 @@ def begin(
 ) -> Running:
     """Start function(*args, **kwargs) in a child process, which gets a copy of the arguments as they are now.
 
-    function: at the top level of a module. seconds: after so many the child is killed. memory_mb: how much the child's
-    address space may grow beyond its size after importing (Linux). The thread that calls this must outlive the child:
-    the system ends a child with the thread that started it.
+    function: defined at the top level of a module. seconds: the time after which the child is killed. memory_mb: how
+    much the child's address space may grow after its imports (Linux), in MB. The thread that calls this must outlive
+    the child: the system ends a child with the thread that started it.
     """
     module = _module_of(function)
     waiting = _waiting.get(module)
@@ -165,9 +165,10 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickle numpy's types by name.
+    """Pickle numpy's data types by their names.
 
-    An array that is unpickled otherwise has its own copy of the type, for which ufunc.at has no fast loops.
+    By default unpickling gives each array a copy of its type object. ufunc.at has fast loops only for numpy's own type
+    objects, and takes ten times as long with a copy.
     """
 
     def reducer_override(self, value: Any) -> Any:

@@ -17,10 +17,10 @@ AHEAD = 2
 def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: int) -> Iterator[Any]:
     """Run work(text) for every text on the cluster at address; yields the results in the order in which they are done.
 
-    address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of
-    each task. work is pickled and runs in this process's working folder, which all nodes must share. It returns its
-    errors. A text whose worker dies (a native crash, no memory) yields a GdtoolError. Raises ResourceError without Ray
-    or cluster.
+    address: "local" starts Ray on this machine; else the address that `ray start` printed, "auto", or ray://HOST:PORT.
+    work: pickled, and run in this process's working folder, which all nodes must share; it has to return its errors,
+    not raise them. cores: how many processor cores each task takes. Where a worker process dies (a native crash, no
+    memory) the result is a GdtoolError. Raises ResourceError where Ray is not installed or no cluster answers.
     """
     ray = _connected(address)
     try:
@@ -67,14 +67,18 @@ def _connected(address: str) -> Any:
 
 
 def _knock(address: str) -> None:
-    """Raise OSError when no process listens at HOST:PORT; Ray itself would try for minutes."""
+    """Raise OSError where no process listens at HOST:PORT; Ray itself would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
 def _room(ray: Any, cores: int) -> int:
-    """Return how many tasks may run now; a cluster may grow."""
+    """Return how many tasks may be submitted at a time: one for each `cores` cores of the cluster, and AHEAD more that
+    wait.
+
+    A cluster may grow, so the cores are counted at each call.
+    """
     return max(int(ray.cluster_resources().get("CPU", 1)) // cores, 1) + AHEAD
 
 

@@ -1,8 +1,8 @@
-"""End in order after a signal: raise an exception in the main thread, clean up, exit with 128 + signal.
+"""Turn a signal into an orderly end: raise an exception in the main thread, clean up, exit with 128 + signal.
 
-The exception can only be raised between two steps of Python. Where a native call keeps the main thread for longer than
-GRACE, a second thread runs the clean-up and ends the process. It cannot do so inside a native call that holds the
-interpreter's lock: no Python code runs until that returns.
+Python can raise the exception only between two of its own instructions. Where a native call keeps the main thread busy
+for longer than GRACE seconds, a second thread runs the clean-up and ends the process. It cannot do so inside a native
+call that holds the interpreter's lock: no Python code runs until that call returns.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _clean_ups: list[Callable[[], None]] = []
 
 
 class Stopped(KeyboardInterrupt):
-    """Tell that a signal asked this process to end. It is a KeyboardInterrupt, so that libraries do not catch it."""
+    """Report that a signal asked this process to end. It is a KeyboardInterrupt, so that libraries do not catch it."""
 
     def __init__(self, number: int):
         self.number = number
@@ -82,7 +82,10 @@ def listen() -> Callable[[], None]:
 
 
 def ignore() -> None:
-    """Raise no further exception, since the process is about to end; the second thread still ends it in time."""
+    """Ignore further signals, because the process is about to end.
+
+    The thread that listen() started still ends the process GRACE seconds after the first signal.
+    """
     global _deaf
     _deaf = True
 
@@ -113,15 +116,15 @@ def temporary_folder() -> Iterator[Path]:
 
 
 class TimeOver(BaseException):
-    """Tell that the time limit is over; not an Exception, so that no fallback takes it for a failed attempt."""
+    """Report that a time limit is over; not an Exception, so that no fallback takes it for a failed attempt."""
 
 
 @contextmanager
 def time_limit(seconds: float, late: GdtoolError) -> Iterator[None]:
-    """Raise `late` in a block that takes longer than `seconds`.
+    """Raise the error `late` in a block that takes longer than `seconds`.
 
-    Where a native call goes on for GRACE more, the process ends with that error. The limit holds in the main thread
-    only, where the system has SIGALRM. It cannot be nested.
+    Where a native call goes on for GRACE seconds more, the whole process ends with that error. The limit holds in the
+    main thread only, and only where the system has SIGALRM. It cannot be nested.
     """
     global _late
     if _ALARM is None or threading.current_thread() is not threading.main_thread():

@@ -1,4 +1,4 @@
-"""Errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
+"""Define the errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ class GdtoolError(Exception):
 
 
 class UsageError(GdtoolError):
-    """Tell that the command line asks for something impossible."""
+    """Report that the command line asks for something impossible."""
 
     exit_code = 2
 
 
 class InputError(GdtoolError):
-    """Tell that a file, folder or manifest breaks the rules of its format."""
+    """Report that a file, folder or manifest breaks the rules of its format."""
 
     exit_code = 3
 
 
 class OutputError(GdtoolError):
-    """Tell that something cannot be read or written: permission, disk, lock."""
+    """Report that something cannot be read or written: permission, disk, lock."""
 
     exit_code = 4
 
 
 class ResourceError(GdtoolError):
-    """Tell that an optional dependency or a device is missing, or that a memory or time limit is reached."""
+    """Report that an optional dependency or a device is missing, or that a memory or time limit is reached."""
 
     exit_code = 5
 
 
 class ChildFailed(Exception):
-    """Tell that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
+    """Report that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
 # What to do about an error of the system, by its number.
@@ -159,8 +159,8 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 def from_exception(error: Exception, subject: object) -> GdtoolError:
     """Turn any exception that was raised while working on subject into an error for the user.
 
-    A GdtoolError stays. Faults of the system, the memory, a device or a missing library become OutputError, InputError
-    or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
+    A GdtoolError is returned unchanged. Faults of the system, the memory, a device or a missing library become
+    OutputError, InputError or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
     """
     if isinstance(error, GdtoolError):
         return error

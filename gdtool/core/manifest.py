@@ -37,7 +37,7 @@ class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InputEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a folder was made from."""
+    """One input that the folder was made from."""
 
     role: Annotated[str, Meta(description="source, or the name of the flag that gave it")]
     path: Annotated[str, Meta(description="relative to the folder, or procedural:SEED")]

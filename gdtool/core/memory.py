@@ -15,9 +15,10 @@ SHARE = 0.5
 
 
 def most_held() -> int:
-    """Return the bytes that one input may take.
+    """Return the most bytes that reading one input may take.
 
-    They are SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS) where that is smaller.
+    This is the share SHARE of the machine's memory, or of the limit on the address space (RLIMIT_AS) where that is
+    smaller.
     """
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
@@ -29,9 +30,10 @@ def most_held() -> int:
 
 
 def require_memory(size: int, subject: object, what: str, cure: str, most: int | None = None) -> None:
-    """Raise ResourceError, with the prediction, when `size` bytes are more than one input may take.
+    """Raise ResourceError where the content of an input is predicted to take more memory than one input may.
 
-    subject: the input. what: the part of it that would take them. most: a smaller limit in bytes than most_held().
+    size: the predicted bytes. subject: the input. what: the part of the input that takes them, for the message. most: a
+    limit in bytes, where it should be smaller than most_held().
     """
     limit = most_held() if most is None else min(most, most_held())
     if size > limit:

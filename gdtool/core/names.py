@@ -132,10 +132,10 @@ def relative_parts(
 
 
 def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
-    """Return the path of the file that a relative URI or a customary file name in a model stands for.
+    """Return the path of the file that a relative URI in a model stands for; plain file names are accepted too.
 
-    The URI is percent-decoded first and checked then. A file whose name has the percent signs of the URI comes first.
-    Backslashes count as slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
+    The URI is percent-decoded before it is checked. Where a file exists under the undecoded name, with its percent
+    signs, that file is taken. Backslashes count as slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
     """
     decoded = unquote(uri)
     for text in (uri, decoded):

@@ -78,7 +78,7 @@ def workspace_path(target: Path, key: str) -> Path:
 
 
 def _beside(target: Path, key: str, use: str) -> Path:
-    """Return the path of one of the folders beside the target."""
+    """Return the hidden path `.<target>.<key>.<use>` beside the target; use: "partial", "old" or "work"."""
     return target.parent / f".{target.name}.{key[:KEY_DIGITS]}.{use}"
 
 

@@ -26,7 +26,7 @@ _SPECIAL = (
 def require_regular_file(path: Path) -> None:
     """Raise InputError unless path is a regular file or a link to one: reading a FIFO or a device may never end.
 
-    Raises OutputError where the system does not let it be looked at.
+    Raises OutputError where the system denies access to it.
     """
     try:
         mode = Path(path).stat().st_mode
@@ -93,7 +93,7 @@ def parse_json(content: bytes | str, subject: object) -> Any:
 
 
 class _Refused(Exception):
-    """Tell that a value of the JSON is not accepted; str() says which and why."""
+    """Report that a value of the JSON is not accepted; str() says which and why."""
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

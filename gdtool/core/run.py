@@ -63,7 +63,7 @@ class Result:
 
 
 class ReadInput(NamedTuple):
-    """An input of a run: its role in the manifest, itself, and its digest."""
+    """Hold an input of a run: its role in the manifest, the source, and the sha256 of its content."""
 
     role: str
     source: Source
@@ -72,10 +72,10 @@ class ReadInput(NamedTuple):
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a stage: what it reads, where its result goes, and the key that identifies the result.
+    """Hold one run of a stage: what it reads, where its result goes, and the key that identifies the result.
 
-    named: the output as the user names it. target: where it really lies, which differs where a link lies at named.
-    options: as the manifest records them. warnings: what to tell before the run.
+    named: the output path as the user names it. target: the path it resolves to, which differs where `named` is a link.
+    options: plain values, as the manifest records them. warnings: lines to show before the run.
     """
 
     stage: Stage

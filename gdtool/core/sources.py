@@ -24,7 +24,10 @@ PICTURES = "pictures"  # a kind of source: a folder of another program, without 
 
 
 def expand(text: str) -> Iterator[str]:
-    """Expand procedural:A..B to its seeds; any other text stays. Raises UsageError for a malformed range."""
+    """Expand procedural:A..B to one source for each seed; any other text is returned unchanged.
+
+    Raises UsageError for a malformed range.
+    """
     if not text.startswith("procedural:"):
         yield text
         return
@@ -46,8 +49,8 @@ def expand(text: str) -> Iterator[str]:
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     """Yield sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
-    Raises UsageError when both are empty, since a pipe whose first stage failed fails as a whole. Arguments that cannot
-    be sources raise it before any of them is worked on.
+    Raises UsageError where both are empty: then the command before the pipe has failed, and the whole pipe has to fail.
+    Arguments that cannot be sources raise UsageError before the first source is worked on.
     """
     empty = True
     for text in arguments:
@@ -142,9 +145,10 @@ HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
 
 
 def hub_folder(text: str, revision: str = "") -> str:
-    """Return the folder of a Hugging Face hub id, downloaded once; any other text, and an existing path, stays.
+    """Return the folder of a Hugging Face hub id, downloaded once; an existing path and text that is no id are returned
+    unchanged.
 
-    revision: a branch, tag or commit; "": the main branch. Raises ResourceError without huggingface_hub, InputError
+    revision: a branch, tag or commit; "" is the main branch. Raises ResourceError without huggingface_hub, InputError
     where the download fails.
     """
     if Path(text).exists() or not HUB_ID.match(text):

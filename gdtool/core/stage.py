@@ -29,10 +29,11 @@ FILE = {"file": True}
 
 @dataclass(frozen=True)
 class SecondInput:
-    """Declare an input beside the source: it has a flag, and with `search` is found along the provenance chain.
+    """Declare an input beside the source, which the user names by a flag.
 
-    default: a folder that ships with gdtool, as "package/folder", where neither gives one. foreign: a folder of another
-    program, or an id of the Hugging Face hub, is accepted too, and arrives as a Path.
+    search: without the flag it is looked for along the provenance chain. default: the folder to take where neither
+    gives one, as "package/folder" of what ships with gdtool. foreign: a folder of another program, or an id of the
+    Hugging Face hub, is accepted too, and is passed as a Path.
     """
 
     kind: str

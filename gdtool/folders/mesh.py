@@ -63,9 +63,10 @@ def read_obj(path: Path) -> QuadMesh:
 
 
 def _cut(sizes: np.ndarray) -> np.ndarray:
-    """Cut polygons into quads and triangles, which have -1 as fourth corner; returns (q, 4) places among all corners.
+    """Cut polygons into quads and triangles, whose fourth corner is -1.
 
-    sizes (p,): the number of corners of each polygon.
+    sizes (p,): the number of corners of each polygon. Returns indices (q, 4) into the corners of all polygons, one
+    polygon after the other.
     """
     first = np.cumsum(sizes) - sizes
     pieces = (sizes - 1) // 2

@@ -108,10 +108,10 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
 
 
 def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
-    """Read the picture that the views were made of, and the camera that it looks through.
+    """Read the picture that the views of a folder were made of, and the camera of the view that it shows.
 
-    The picture (h, w, 4) has linear color and straight alpha. None where the folder holds none. Raises InputError for
-    one whose size is not a whole multiple of its view's.
+    The picture (h, w, 4) has linear color and straight alpha. Returns None where the folder has no such picture. Raises
+    InputError where its size is not a whole multiple of the size of that view.
     """
     from gdtool.images.color import linear_from_srgb, unit_range
     from gdtool.images.io import read_image

@@ -14,7 +14,7 @@ from gdtool.geometry.meshes import TriMesh
 
 @dataclass(frozen=True)
 class Grid:
-    """Sample points at origin + step * (i, j, k), i, j, k below shape.
+    """Define a regular grid of sample points: origin + step * (i, j, k), with i, j, k below shape.
 
     origin (3,) and step in world units; shape: the number of points along each axis.
     """

@@ -12,9 +12,9 @@ from gdtool.geometry.topology import Edges, corner_fans, edges_of
 def separate_sheets(mesh: TriMesh, rounds: int = 3) -> TriMesh:
     """Give each sheet of a closed mesh its own copy of the edges where several sheets meet.
 
-    Faces on both sides of one wedge of the inside stay together; a sheet that comes off becomes a piece. Edges with an
-    odd number of faces, or with more faces in one direction than in the other, are left. rounds: how often it may run
-    again on what it could not separate at once.
+    Faces on both sides of one wedge of the inside stay connected. A sheet that is connected nowhere else becomes a
+    piece of its own. Edges with an odd number of faces, or with more faces in one direction than in the other, are
+    left. rounds: how often the pass is repeated on edges that it could not separate at once.
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)

@@ -31,9 +31,9 @@ _MAX_SMALL_SHARE = 0.02  # of the faces: pieces beyond the expected number that 
 
 
 class CleanMesh(NamedTuple):
-    """A repaired mesh.
+    """Hold a repaired mesh.
 
-    repairs: how many of each kind were made, by name; is_closed: whether it is watertight.
+    repairs: how many of each kind were made, by name; is_closed: whether the mesh is watertight.
     """
 
     mesh: TriMesh
@@ -156,9 +156,9 @@ def _used_count(faces: np.ndarray, count: int) -> int:
 
 
 def _closed_with_one_fan(faces: np.ndarray, allow_doubled: bool = True) -> bool | None:
-    """Whether the faces around each vertex of a closed mesh form one fan; None for an open mesh.
+    """Tell whether the faces around each vertex of a closed mesh form one fan; None for an open mesh.
 
-    allow_doubled: False makes two triangles with the same corners a reason to say no.
+    allow_doubled: with False the answer is also False where two triangles have the same corners.
     """
     if not has_even_edge_counts(faces) or (twins := twins_of(faces)) is None:
         return None
@@ -166,7 +166,7 @@ def _closed_with_one_fan(faces: np.ndarray, allow_doubled: bool = True) -> bool 
 
 
 def _has_doubled_triangle(twins: np.ndarray) -> bool:
-    """Whether two triangles have the same corners; twins (3 f,) as from twins_of()."""
+    """Tell whether two triangles have the same corners; twins (3 f,) as from twins_of()."""
     beside = twins.reshape(-1, 3) // 3
     return bool(((beside[:, 0] == beside[:, 1]) & (beside[:, 1] == beside[:, 2])).any())
 

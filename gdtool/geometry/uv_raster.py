@@ -30,7 +30,7 @@ def _snapped(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, 
 
 
 def _chunks(cost: np.ndarray, limit: int) -> Iterator[slice]:
-    """Yield consecutive slices whose summed cost stays near limit; each holds at least one element."""
+    """Yield consecutive slices of cost (n,) whose sums stay near limit; each holds at least one element."""
     total = np.cumsum(cost)
     start = 0
     while start < len(cost):
@@ -195,9 +195,10 @@ def extend_owners(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Extend the charts' triangles to texels just outside, which lookups at a chart's border read.
 
-    face_idx (size, size) as from rasterize_uv(). Returns texel (n,), row-major indices of up to `rings` texels around
-    all charts; owner (n,), the face of the nearest covered texel of a smaller ring; and barycentric (n, 3) float64,
-    linearly extrapolated and clamped to `farthest` outside [0, 1].
+    face_idx (size, size) as from rasterize_uv(). rings: how many texels wide the extension is; each ring is one texel
+    around the one before. Returns texel (n,), row-major indices of the texels around all charts; owner (n,), the face
+    of the nearest texel of the ring before; and barycentric (n, 3) float64, linearly extrapolated and clamped to
+    `farthest` outside [0, 1].
     """
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)

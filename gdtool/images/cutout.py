@@ -27,9 +27,9 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
 
 
 def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Segment with the narrow and with the wide frame.
+    """Segment a picture by GrabCut twice: with a narrow and with a wide frame along its edge taken for background.
 
-    Returns both masks (h, w), boolean, and their intersection over union.
+    color (h, w, 3): sRGB in [0, 1]. Returns both foreground masks (h, w), boolean, and their intersection over union.
     """
     narrow, wide = (_grabcut(color, inset) for inset in INSETS)
     either = (narrow | wide).sum()

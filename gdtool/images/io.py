@@ -41,8 +41,9 @@ def read_image(path: str | Path) -> np.ndarray:
     Palettes are expanded, EXIF rotation is applied.
 
     Raises InputError for a file that is not one complete still image in grey or RGB, is not regular, or holds values
-    that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as stored, or MAX_HELD or half of the memory
-    while it is read; OutputError when the file cannot be read.
+    that are not finite. Raises ResourceError beyond 16384 pixels a side, beyond 1 GiB of stored pixels, and where
+    reading would take more than 4 GiB (MAX_HELD) or half of the memory. Raises OutputError when the file cannot be
+    read.
     """
     path = Path(path)
     require_regular_file(path)
@@ -152,9 +153,10 @@ def _check_spec(path: Path, spec) -> None:
 
 
 def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
-    """Raise ResourceError when reading takes more than MAX_HELD or half of the memory.
+    """Raise ResourceError where reading an image would take more than 4 GiB (MAX_HELD) or half of the memory.
 
-    channels: to be read, of itemsize bytes each as decoded.
+    channels: how many are read, each of itemsize bytes a pixel once decoded. copied: the pixels are copied once more,
+    to turn them or to put channels in order.
     """
     pixels = spec.width * spec.height * channels
     size = pixels * spec.format.size() + pixels * itemsize * (2 if copied else 1)

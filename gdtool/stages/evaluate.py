@@ -28,7 +28,7 @@ Report = dict[str, bool | int | float | str]
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of evaluate."""
+    """Hold the options of `gdtool evaluate`."""
 
     frame: Annotated[
         Literal["auto", "source", "box", "same"],

@@ -21,7 +21,7 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of import-views."""
+    """Hold the options of `gdtool import-views`."""
 
     format: Annotated[
         Literal["auto", "wonder3d", "nerf", "plain"],

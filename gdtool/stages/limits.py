@@ -19,9 +19,11 @@ _QUICK = 0.5
 
 @contextmanager
 def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]:
-    """Raise ResourceError in a block that takes longer than OVER x seconds + MORE.
+    """Raise ResourceError in a block that takes so long that the run could not end within OVER * seconds + MORE
+    seconds.
 
-    option: the option that gives the seconds. name: of the object. cure: what to do about it.
+    seconds: the time limit that the user gave by `option`. name: of the object, and cure: what to do about it, for the
+    message.
     """
     most = OVER * seconds + MORE - _UNWIND
     with time_limit(
@@ -31,9 +33,10 @@ def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]
 
 
 def require_time(needed: float, seconds: float, option: str, name: str, cure: str) -> None:
-    """Raise ResourceError, before the work, where even the quickest method takes longer than held_to() permits.
+    """Raise ResourceError before the work starts, where even the quickest method takes longer than held_to() permits.
 
-    needed: seconds of the quickest method on the machine that it was measured on.
+    needed: seconds of the quickest method on the machine where it was measured. seconds, option, name, cure: as for
+    held_to().
     """
     if _QUICK * needed > OVER * seconds + MORE - _UNWIND:
         raise ResourceError(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of reconstruct."""
+    """Hold the options of `gdtool reconstruct`."""
 
     method: Annotated[
         Literal["grid", "paper"],

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of remesh."""
+    """Hold the options of `gdtool remesh`."""
 
     faces: Annotated[int, Meta(ge=16, le=2_000_000, description="Number of quads, met within 3 %.")] = 20000
     quad_size: Annotated[
@@ -186,7 +186,7 @@ def _clean(mesh: TriMesh, inputs: Inputs, options: Options, out: Output) -> TriM
 
 
 def _goal(options: Options):
-    """Make the room's Goal of the options."""
+    """Convert the options to the Goal that remesh.methods reads."""
     from gdtool.remesh.methods import Goal
     from gdtool.remesh.task import Request
 

@@ -29,7 +29,7 @@ ALL = (*DOMAINS, "closed_form")  # every image that a view can have
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of render-dataset."""
+    """Hold the options of `gdtool render-dataset`."""
 
     size: Annotated[int, Meta(ge=16, le=4096, description="Width and height of a view, pixels.")] = 256
     samples: Annotated[

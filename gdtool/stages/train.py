@@ -29,7 +29,7 @@ HELD_OUT = 4  # objects; all but one where there are fewer
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of train."""
+    """Hold the options of `gdtool train`."""
 
     preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
     ablation: Annotated[

@@ -21,7 +21,7 @@ from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of unwrap."""
+    """Hold the options of `gdtool unwrap`."""
 
     size: Annotated[int, Meta(ge=16, le=65536, description="Side of the texture that the padding is for, texels.")] = (
         2048

@@ -46,7 +46,7 @@ SIMPLIFY = "export it with fewer faces or fewer instances"
 
 @dataclass(frozen=True)
 class _Elements:
-    """Where equally spaced elements lie: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
+    """Locate equally spaced elements: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
 
     view: int
     offset: int
@@ -60,10 +60,8 @@ class GltfFile:
     """Hold an opened .glb or .gltf: its decoded document, and its bytes and accessors on demand.
 
     Buffers, buffer views and the chunks of a GLB are memory views of what was read, not copies. All methods raise
-    InputError for breaches of the specification that they meet, and ResourceError where the result would take more
-    memory than one input may.
-
-    notes collects what was ignored or assumed, a line each.
+    InputError where they meet a breach of the specification, and ResourceError where the result would take more memory
+    than one input may. notes collects what was ignored or assumed, a line each.
     """
 
     def __init__(self, path: Path):

@@ -24,7 +24,9 @@ _ROWS_AT_ONCE = 64  # converted in float32; a map of 4096² pixels at once would
 
 @dataclass(frozen=True)
 class SpecularGlossinessMaterial:
-    """A material to convert: what both models share, the extension's record and textures, and the file's index."""
+    """Hold a material to convert: what both models share, the extension's record and textures, and its index in the
+    file.
+    """
 
     material: Material
     record: SpecularGlossiness
@@ -34,7 +36,7 @@ class SpecularGlossinessMaterial:
 
 
 def convert(file: GltfFile, source: SpecularGlossinessMaterial) -> Material:
-    """Return the metallic-roughness material that reflects most nearly what a specular-glossiness one does.
+    """Return the metallic-roughness material whose reflection is nearest to that of a specular-glossiness one.
 
     Raises InputError where the two textures are looked up differently, ResourceError for maps that are too large.
     """
@@ -115,7 +117,7 @@ def clipped_rgba(red: float, green: float, blue: float, alpha: float) -> tuple[f
 
 
 def _lookup(texture: Texture) -> tuple:
-    """List the properties of a texture that decide which texel a point of the surface gets."""
+    """List the properties of a texture that decide which texel a point of the surface reads."""
     return texture.uv_set, texture.offset, texture.rotation, texture.scale, texture.wrap_u, texture.wrap_v
 
 

@@ -203,7 +203,10 @@ def circle(count: int = 40) -> np.ndarray:
 
 
 def rectangle(width: float, depth: float, subdivisions: int = 6) -> np.ndarray:
-    """Make the outline (n, 2) of a rectangle about the origin; sides are subdivided: field finishes need vertices."""
+    """Make the outline (n, 2) of a rectangle about the origin, with each side cut into `subdivisions` pieces.
+
+    Finishes of solid fields look their pattern up at vertices, so a side needs several.
+    """
     corners = 0.5 * np.array([[width, -depth], [width, depth], [-width, depth], [-width, -depth]])
     return subdivided(corners, subdivisions)
 

@@ -128,7 +128,10 @@ def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: i
 
 
 def _matrix(rows: Any) -> np.ndarray | None:
-    """Convert nested lists to (3 or 4, 4) float64; None for another shape or numbers beyond _MOST_PIXELS."""
+    """Convert nested lists to a matrix (3 or 4, 4) float64.
+
+    Returns None for another shape, and for values that are not finite or too large to be meant (above _MOST_PIXELS).
+    """
     if (
         not isinstance(rows, list)
         or len(rows) not in (3, 4)

@@ -102,7 +102,7 @@ def _find(folder: Path, domain: str, view: str) -> Path | None:
 
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
-    """Return the height and width of a picture. Raises InputError where its camera has others."""
+    """Return the height and width of a picture in pixels. Raises InputError where its camera has another size."""
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             path,
