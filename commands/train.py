@@ -17,7 +17,7 @@ command.params.append(
     click.Option(
         ["--plan"],
         is_flag=True,
-        help="Tell memory, FLOPs and time of the training, computed from its structure; no data.",
+        help="Print the memory, FLOPs and time that the training needs, computed from its structure; reads no data.",
     )
 )
 assert command.callback is not None

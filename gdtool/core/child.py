@@ -63,10 +63,10 @@ def begin(
     """
     module = _module_of(function)
     waiting = _waiting.get(module)
-    place = None
+    working_folder = None
     with contextlib.suppress(OSError):  # it may have been deleted
-        place = str(Path.cwd())
-    request = _pickled((place, module, function.__qualname__, args, kwargs, memory_mb))
+        working_folder = str(Path.cwd())
+    request = _pickled((working_folder, module, function.__qualname__, args, kwargs, memory_mb))
     process = waiting.pop() if waiting else _started((module,))
     return Running(f"{module}:{function.__qualname__}", process, request, seconds)
 
@@ -101,7 +101,7 @@ class Running:
         self._timer = threading.Timer(seconds, self._stop)
         self._timer.daemon = True
         self._timer.start()
-        # The pipes are served from now on, so that the child never waits for result() to be asked for.
+        # A thread serves the pipes from now on, so that the child never waits for a call of result().
         self._talk = threading.Thread(target=self._converse, args=(request,), daemon=True)
         self._talk.start()
 
@@ -199,11 +199,11 @@ def serve() -> None:
             with contextlib.suppress(Exception):  # reported when one of its functions is requested
                 importlib.import_module(module)
         try:
-            place, module, name, args, kwargs, memory_mb = pickle.load(file)
+            working_folder, module, name, args, kwargs, memory_mb = pickle.load(file)
         except EOFError:  # it was prepared and is not needed
             os._exit(0)
     with contextlib.suppress(OSError, TypeError):
-        os.chdir(place)
+        os.chdir(working_folder)
     answer = _answer(module, name, args, kwargs, memory_mb)
     with os.fdopen(answer_to, "wb") as file:
         file.write(_pickled(answer))
@@ -237,9 +237,9 @@ def _limit_memory(megabytes: int) -> None:
 
     with Path("/proc/self/statm").open() as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    limit, most = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
-    if most != resource.RLIM_INFINITY:  # a child's child cannot have more than the child
-        limit = min(limit, most)
+    limit, hard_limit = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
+    if hard_limit != resource.RLIM_INFINITY:  # a child's child cannot have more than the child
+        limit = min(limit, hard_limit)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 

@@ -24,15 +24,15 @@ def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: 
     """
     ray = _connected(address)
     try:
-        task = ray.remote(num_cpus=cores, max_retries=1)(_within)
+        task = ray.remote(num_cpus=cores, max_retries=1)(_work_in_folder)
         folder = str(Path.cwd())
         waiting: dict[Any, str] = {}
         for text in texts:
             waiting[task.remote(folder, work, text)] = text
-            full = len(waiting) >= _room(ray, cores)
+            full = len(waiting) >= _task_slots(ray, cores)
             while full or _any_done(ray, waiting):
                 yield _next(ray, waiting)
-                full = len(waiting) >= _room(ray, cores)
+                full = len(waiting) >= _task_slots(ray, cores)
         while waiting:
             yield _next(ray, waiting)
     finally:
@@ -49,7 +49,7 @@ def _connected(address: str) -> Any:
     except ImportError:
         raise ResourceError("--ray", "needs the package ray", "pip install 'gdtool[ray]'") from None
     try:
-        _knock(address)
+        _require_listener(address)
         ray.init(
             None if address == "local" else address,
             log_to_driver=False,
@@ -66,14 +66,14 @@ def _connected(address: str) -> Any:
     return ray
 
 
-def _knock(address: str) -> None:
+def _require_listener(address: str) -> None:
     """Raise OSError where no process listens at HOST:PORT; Ray itself would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
-def _room(ray: Any, cores: int) -> int:
+def _task_slots(ray: Any, cores: int) -> int:
     """Return how many tasks may be submitted at a time: one for each `cores` cores of the cluster, and AHEAD more that
     wait.
 
@@ -100,7 +100,7 @@ def _next(ray: Any, waiting: dict[Any, str]) -> Any:
         return GdtoolError(text, f"its worker on the cluster failed ({reason[:120]})", "run it alone to see why")
 
 
-def _within(folder: str, work: Callable[[str], Any], text: str) -> Any:
+def _work_in_folder(folder: str, work: Callable[[str], Any], text: str) -> Any:
     """Run work in the driver's folder, to which relative paths refer."""
     from gdtool.core import log
 

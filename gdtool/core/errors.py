@@ -85,12 +85,12 @@ def from_os_error(error: OSError, subject: object) -> GdtoolError:
     OutputError for all else.
     """
     fact = error.strerror or str(error) or type(error).__name__
-    fact, place = fact[0].lower() + fact[1:], error.filename or subject
+    fact, named = fact[0].lower() + fact[1:], error.filename or subject
     if error.errno in _BAD_NAMES:
-        return InputError(place, fact, _BAD_NAMES[error.errno])
+        return InputError(named, fact, _BAD_NAMES[error.errno])
     if error.errno in _LIMITS:
-        return ResourceError(place, fact, _LIMITS[error.errno])
-    return OutputError(place, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
+        return ResourceError(named, fact, _LIMITS[error.errno])
+    return OutputError(named, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
 
 
 # The Debian package of each shared library that gdtool's dependencies are linked with.
@@ -168,7 +168,9 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     first = first_line(error)
     native = isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] in ("cv2", "torch", "scipy")
     if isinstance(error, MemoryError) or native and _NO_MEMORY.search(str(error)):
-        problem = ResourceError(subject, "ran out of memory" + asked_for(error), "lower the resolution or free memory")
+        problem = ResourceError(
+            subject, "ran out of memory" + allocation_size(error), "lower the resolution or free memory"
+        )
     elif isinstance(error, OSError):
         problem = from_os_error(error, subject)
     elif isinstance(error, ImportError) and is_unmapped(error):
@@ -197,7 +199,7 @@ def is_unmapped(error: BaseException) -> bool:
     return bool(_NOT_MAPPED.search(str(error)))
 
 
-def asked_for(error: BaseException) -> str:
+def allocation_size(error: BaseException) -> str:
     """Return the size of the allocation that failed, in parentheses; empty where the message does not say."""
     request = _ASKED.search(str(error))
     if not request:

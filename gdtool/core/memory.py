@@ -14,7 +14,7 @@ from gdtool.core.errors import ResourceError
 SHARE = 0.5
 
 
-def most_held() -> int:
+def max_input_bytes() -> int:
     """Return the most bytes that reading one input may take.
 
     This is the share SHARE of the machine's memory, or of the limit on the address space (RLIMIT_AS) where that is
@@ -33,9 +33,9 @@ def require_memory(size: int, subject: object, what: str, cure: str, most: int |
     """Raise ResourceError where the content of an input is predicted to take more memory than one input may.
 
     size: the predicted bytes. subject: the input. what: the part of the input that takes them, for the message. most: a
-    limit in bytes, where it should be smaller than most_held().
+    limit in bytes, where it should be smaller than max_input_bytes().
     """
-    limit = most_held() if most is None else min(most, most_held())
+    limit = max_input_bytes() if most is None else min(most, max_input_bytes())
     if size > limit:
         raise ResourceError(
             subject,

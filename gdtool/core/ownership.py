@@ -62,7 +62,7 @@ def refuse_loss(place: Path, kind: str) -> None:
     present = _files_below(place)
     if not present:
         return
-    manifest = _own_manifest(place, present)
+    manifest = _manifest_to_replace(place, present)
     if manifest.kind != kind:
         raise UsageError(place, f"holds {manifest.kind}, not {kind}", CURE)
     if not (manifest.stage and manifest.stage_version and manifest.key):
@@ -86,15 +86,15 @@ def refuse_index(root: Path) -> None:
     """Raise UsageError where root has a manifest.json that is not a dataset index written by gdtool."""
     if not (root / MANIFEST).exists():
         return
-    manifest = _own_manifest(root, [MANIFEST])
+    manifest = _manifest_to_replace(root, [MANIFEST])
     if manifest.kind != "dataset" or not manifest.tool_version:
         raise UsageError(root / MANIFEST, f"describes {manifest.kind}, not a dataset that gdtool wrote", CURE)
 
 
-def _own_manifest(place: Path, present: list[str]) -> Manifest:
+def _manifest_to_replace(place: Path, present: list[str]) -> Manifest:
     """Read the manifest of a folder that a run would replace. Raises UsageError where there is none of gdtool's."""
     if MANIFEST not in present:
-        raise UsageError(place / present[0], "is in the way, and gdtool did not write that folder", CURE)
+        raise UsageError(place / present[0], "would be deleted, and gdtool did not write that folder", CURE)
     try:
         return read_manifest(place)
     except InputError as error:

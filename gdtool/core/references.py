@@ -46,7 +46,7 @@ def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "")
     empty name or ".", by which exporters mean no file. Raises InputError for a name that leads more than one folder
     above the model's, links followed.
     """
-    plain = _plain(name)
+    plain = _without_quotes(name)
     if plain in ("", "."):
         return None
     return path_inside(model.parent, f"{folder}/{plain}".lstrip("/"), subject, what, levels_up=OBJ_LEVELS_UP)
@@ -61,8 +61,8 @@ def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = 
     first = obj_file(model, name, subject, what, folder)
     if first is None:
         return None
-    for place in TEXTURE_PLACES:
-        relative = "/".join(part for part in (folder, place, _plain(name)) if part)
+    for texture_folder in TEXTURE_PLACES:
+        relative = "/".join(part for part in (folder, texture_folder, _without_quotes(name)) if part)
         try:
             relative_parts(relative, subject, what, levels_up=OBJ_LEVELS_UP)
         except InputError:  # the name leads out of this place
@@ -92,7 +92,7 @@ def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
 
 def library_folder(name: str) -> str:
     """Return the folder of a library that an mtllib line names, relative to the model's."""
-    return _plain(name).rpartition("/")[0]
+    return _without_quotes(name).rpartition("/")[0]
 
 
 def map_name(words: list[str]) -> tuple[str, str | None]:
@@ -102,10 +102,11 @@ def map_name(words: list[str]) -> tuple[str, str | None]:
         count = _OPTION_WORDS[words[i]]
         if words[i] == "-imfchan" and i + 1 < len(words):
             channel = words[i + 1]
-        taken = 0
-        while taken < count and i + 1 + taken < len(words) - 1 and (count < 3 or _is_number(words[i + 1 + taken])):
-            taken += 1
-        i += 1 + taken
+        number_count = 0
+        most = min(count, len(words) - 2 - i)
+        while number_count < most and (count < 3 or _is_number(words[i + 1 + number_count])):
+            number_count += 1
+        i += 1 + number_count
     return " ".join(words[i:]), channel
 
 
@@ -190,7 +191,7 @@ def _obj_files(path: Path) -> list[Path]:
     return out
 
 
-def _plain(name: str) -> str:
+def _without_quotes(name: str) -> str:
     """Return a name without quotes, with forward slashes; of an absolute one the last part."""
     plain = name.strip().strip('"').replace("\\", "/")
     return plain.rsplit("/", 1)[-1] if plain.startswith("/") or plain[1:3] == ":/" else plain

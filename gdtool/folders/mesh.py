@@ -37,8 +37,10 @@ def read_obj(path: Path) -> QuadMesh:
 
     lines = read_lines(path)
     points, coordinates = lines.vertices, lines.uvs * (1, -1) + (0, 1)
-    place = _cut(lines.sizes)
-    quads, corners = (np.where(place >= 0, lines.corners[:, column].astype(np.int32)[place], -1) for column in (0, 1))
+    corner_idx = _cut(lines.sizes)
+    quads, corners = (
+        np.where(corner_idx >= 0, lines.corners[:, column].astype(np.int32)[corner_idx], -1) for column in (0, 1)
+    )
     if quads.max() >= len(points):
         raise InputError(
             path,

@@ -63,7 +63,7 @@ def enclosed_bodies_warning(mesh: TriMesh, welded: bool = True) -> str | None:
         return None
     bodies = "1 closed body lies" if count == 1 else f"{count} closed bodies lie"
     return (
-        f"{bodies} inside another, with {share:.1%} of the faces, seen from nowhere outside; remove what is not wanted"
+        f"{bodies} inside another, with {share:.1%} of the faces, not visible from outside; remove what is not wanted"
     )
 
 

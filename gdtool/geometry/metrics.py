@@ -266,7 +266,7 @@ def depth_cloud(mesh: TriMesh) -> np.ndarray:
     for camera in sync_cameras():
         origins, directions = (array.reshape(-1, 3) for array in camera_rays(camera))
         hits = caster.first_hit(origins, directions)
-        parts.append(origins[hits.found] + hits.distance[hits.found, None] * directions[hits.found])
+        parts.append(origins[hits.is_hit] + hits.distance[hits.is_hit, None] * directions[hits.is_hit])
     return voxel_downsample(np.concatenate(parts), SYNC_VOXEL)
 
 

@@ -35,7 +35,7 @@ class Hits:
     barycentric: np.ndarray
 
     @property
-    def found(self) -> np.ndarray:
+    def is_hit(self) -> np.ndarray:
         """(n,) bool: which rays hit."""
         return self.face_idx >= 0
 
@@ -186,15 +186,15 @@ def is_convex(mesh: TriMesh, tolerance: float = 1e-6) -> bool:
     points = mesh.vertices[used]
     extent = float((points.max(0) - points.min(0)).max())
     normals, areas = face_normals(mesh)
-    solid = np.flatnonzero(areas > 1e-12 * extent**2)
-    few = solid[:: max(1, len(solid) // 64)]
-    if not _on_one_side(mesh, normals, few, points, tolerance * extent):
+    with_area = np.flatnonzero(areas > 1e-12 * extent**2)
+    sampled = with_area[:: max(1, len(with_area) // 64)]
+    if not _on_one_side(mesh, normals, sampled, points, tolerance * extent):
         return False
-    if len(solid) * len(points) > _MAX_PAIRS:
-        depth = _depth_in_hull(TriMesh(mesh.vertices, mesh.faces[solid]), points)
+    if len(with_area) * len(points) > _MAX_PAIRS:
+        depth = _depth_in_hull(TriMesh(mesh.vertices, mesh.faces[with_area]), points)
         if depth is not None:
             return depth <= tolerance * extent
-    return _on_one_side(mesh, normals, solid, points, tolerance * extent)
+    return _on_one_side(mesh, normals, with_area, points, tolerance * extent)
 
 
 def _on_one_side(mesh: TriMesh, normals: np.ndarray, face_idx: np.ndarray, points: np.ndarray, slack: float) -> bool:

@@ -94,9 +94,9 @@ def clean(mesh: TriMesh, subject: object = "mesh") -> CleanMesh:
         # A closed mesh keeps its indices: welding could join sheets that only touch.
         welded = _weld(TriMesh(vertices, faces), extent * WELD_SHARE)
         _note(repairs, "welded_vertices", _used_count(faces, len(vertices)) - _used_count(welded, len(vertices)))
-        kept = np.flatnonzero(~has_repeated_corner(welded))
-        _note(repairs, "degenerate_faces", len(welded) - len(kept) + repairs.get("degenerate_faces", 0))
-        faces, normals, areas = (array.take(kept, 0) for array in (welded, normals, areas))
+        kept_idx = np.flatnonzero(~has_repeated_corner(welded))
+        _note(repairs, "degenerate_faces", len(welded) - len(kept_idx) + repairs.get("degenerate_faces", 0))
+        faces, normals, areas = (array.take(kept_idx, 0) for array in (welded, normals, areas))
         one_fan = _closed_with_one_fan(faces, allow_doubled=False)
     if not one_fan:
         return _repair_structure(TriMesh(vertices, faces), extent, repairs, subject)

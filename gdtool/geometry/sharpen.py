@@ -129,8 +129,8 @@ def _crease_moves(
     vertices, faces = mesh.vertices, mesh.faces
     maybe, used = _may_be_bent(mesh, crease_degrees / 2)
     # Only a face with both ends of a bent edge among its corners can have one: these are few in a fine mesh.
-    few = np.flatnonzero(marked_corner_counts(faces, maybe) > 1)
-    ends, pairs, angle = dihedral_degrees(TriMesh(vertices, faces.take(few, 0)))
+    candidates = np.flatnonzero(marked_corner_counts(faces, maybe) > 1)
+    ends, pairs, angle = dihedral_degrees(TriMesh(vertices, faces.take(candidates, 0)))
     bent = angle > crease_degrees / 2
     bevel = np.zeros(len(vertices), bool)
     bevel[ends[bent]] = True
@@ -145,7 +145,7 @@ def _crease_moves(
         near_bevel = np.flatnonzero(marked_corner_counts(faces, marked))
     side = np.zeros(len(faces), bool)
     side[near_bevel] = True
-    side[few[pairs[bent]]] = False  # these faces are the bevel
+    side[candidates[pairs[bent]]] = False  # these faces are the bevel
     side = faces.take(np.flatnonzero(side), 0)
     normals, area = face_normals(TriMesh(vertices, side))
     side, normals = side[area > 0], normals[area > 0]
@@ -298,9 +298,9 @@ def collapse_bevels(mesh: TriMesh, moved: np.ndarray, longest: float) -> TriMesh
     collapser.collapse(np.searchsorted(local_idx, half))
     keep = np.ones(len(faces), bool)
     keep[near[~collapser.stays]] = False
-    kept = np.flatnonzero(keep)
-    out = faces.take(kept, 0)
-    out[np.searchsorted(kept, near[collapser.stays])] = local_idx[collapser.became[local[collapser.stays]]]
+    kept_faces = np.flatnonzero(keep)
+    out = faces.take(kept_faces, 0)
+    out[np.searchsorted(kept_faces, near[collapser.stays])] = local_idx[collapser.became[local[collapser.stays]]]
     return compact(TriMesh(vertices, out))
 
 
@@ -348,16 +348,16 @@ class _Rims:
         near (m,): all faces around the edges, with corners (3, m).
         """
         along = self._position[:, a] - self._position[:, b]
-        few = (a != b) & (dot(along, along) <= self._longest**2)
-        a, b = a[few], b[few]
+        short = (a != b) & (dot(along, along) <= self._longest**2)
+        a, b = a[short], b[short]
         if not len(a):
             return
-        of = np.full((2, len(self.became)), -1)
-        of[0, a] = of[1, b] = np.arange(len(a))
-        with_a, with_b = of[0][corners].max(0), of[1][corners].max(0)
+        edge_of = np.full((2, len(self.became)), -1)
+        edge_of[0, a] = edge_of[1, b] = np.arange(len(a))
+        with_a, with_b = edge_of[0][corners].max(0), edge_of[1][corners].max(0)
         shared = (with_a >= 0) & (with_a == with_b)
-        about = [np.unique((edge * of.shape[1] + corners)[:, edge >= 0]) for edge in (with_a, with_b)]
-        common = np.intersect1d(*about, assume_unique=True) // of.shape[1]
+        about = [np.unique((edge * edge_of.shape[1] + corners)[:, edge >= 0]) for edge in (with_a, with_b)]
+        common = np.intersect1d(*about, assume_unique=True) // edge_of.shape[1]
         can = (np.bincount(with_a[shared], minlength=len(a)) == 2) & (np.bincount(common, minlength=len(a)) == 4)
         done = np.zeros(len(a), bool)
         for edge, start, end in ((with_a, a, b), (with_b, b, a)):
@@ -367,8 +367,8 @@ class _Rims:
             area, was = _vector_area(self._position, after), self._area[:, face]
             good = can & ~done
             good[edge[(was[3] > self._tiny) & (dot(was, area) <= 0.1 * np.sqrt(was[3] * area[3]))]] = False
-            taken = good[edge]
-            self._corners[:, face[taken]], self._area[:, face[taken]] = after[:, taken], area[:, taken]
+            collapses = good[edge]
+            self._corners[:, face[collapses]], self._area[:, face[collapses]] = after[:, collapses], area[:, collapses]
             self.became[start[good]] = end[good]
             done |= good
         self.stays[near[shared][done[with_a[shared]]]] = False

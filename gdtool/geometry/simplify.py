@@ -142,8 +142,9 @@ def break_coplanarity(mesh: TriMesh) -> np.ndarray:
     """
     vertices, faces = mesh.vertices, mesh.faces
     sampled = np.arange(len(vertices)) % max(len(vertices) // _SAMPLES, 1) == 0
-    around, few = topology.renumbered(faces[np.flatnonzero(marked_corner_counts(faces, sampled))], len(vertices))
-    sampled_coplanar = _nearly_coplanar(TriMesh(vertices[around], few))[sampled[around]]
+    near_sample = faces[np.flatnonzero(marked_corner_counts(faces, sampled))]
+    around_idx, sampled_faces = topology.renumbered(near_sample, len(vertices))
+    sampled_coplanar = _nearly_coplanar(TriMesh(vertices[around_idx], sampled_faces))[sampled[around_idx]]
     if sampled_coplanar.sum() / sampled.sum() < _MIN_COPLANAR_SHARE:
         return vertices
     coplanar = np.flatnonzero(_nearly_coplanar(mesh))
@@ -307,9 +308,9 @@ def simplify(
     return result
 
 
-def _comparable_error(made: Simplified) -> float:
+def _comparable_error(simplified: Simplified) -> float:
     """Return the error; infinite where nothing was simplified, or measured."""
-    report = made.report
+    report = simplified.report
     return np.inf if report.method == "none" or report.error is None else report.error
 
 
@@ -360,18 +361,18 @@ class _Simplification:
 
     def finish(self, collapsed: _Collapsed, attributes: np.ndarray | None) -> Simplified:
         """Drop small pieces that came off, interpolate attributes, measure the error and scale back."""
-        made = topology.compact(collapsed.mesh)
-        if topology.components(made.faces)[0] > 1 and self.is_closed:
-            made = repair.drop_small_pieces(made, self.pieces)
+        mesh = topology.compact(collapsed.mesh)
+        if topology.components(mesh.faces)[0] > 1 and self.is_closed:
+            mesh = repair.drop_small_pieces(mesh, self.pieces)
         report = SimplifyReport(
-            len(made.faces),
+            len(mesh.faces),
             collapsed.method,
             collapsed.creases,
-            deviation(self.mesh, made) * self.extent if self.options.measure_error else None,
+            deviation(self.mesh, mesh) * self.extent if self.options.measure_error else None,
             "; ".join(self.failed) or None,
         )
-        made_attributes = None if attributes is None else self._interpolate(attributes, made.vertices)
-        return Simplified(TriMesh(made.vertices * self.extent + self.centre, made.faces), made_attributes, report)
+        made_attributes = None if attributes is None else self._interpolate(attributes, mesh.vertices)
+        return Simplified(TriMesh(mesh.vertices * self.extent + self.centre, mesh.faces), made_attributes, report)
 
     def _interpolate(self, attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the input's attributes (v, ...) at its points closest to points (n, 3)."""
@@ -411,18 +412,18 @@ class _Simplification:
             if creases != 0 and not is_quick and not topology_first:
                 break  # folds hinder the collapse, of bevels that were moved where there is no crease
             try:
-                made, creases = self._run_child(call, crease_degrees)
+                mesh, creases = self._run_child(call, crease_degrees)
             except ChildFailed as failure:
                 self.failed.append(str(failure))
                 continue
-            made, is_sound = self._separated_if_torn(made)
-            if not is_sound and (self.is_closed or not _is_usable(made)):
+            mesh, is_sound = self._separated_if_torn(mesh)
+            if not is_sound and (self.is_closed or not _is_usable(mesh)):
                 self.failed.append("the result is not as closed as the input")
-            elif is_quick and not creases and len(made.faces) > self._most_finished_faces:
-                unfinished = made
-                self.failed.append(f"the quick collapse stopped at {len(made.faces)} triangles")
+            elif is_quick and not creases and len(mesh.faces) > self._most_finished_faces:
+                unfinished = mesh
+                self.failed.append(f"the quick collapse stopped at {len(mesh.faces)} triangles")
             else:
-                return _Collapsed(made, QUICK_METHOD if is_quick else TOPOLOGY_METHOD, creases), creases
+                return _Collapsed(mesh, QUICK_METHOD if is_quick else TOPOLOGY_METHOD, creases), creases
         return None if unfinished is None else _Collapsed(unfinished, QUICK_METHOD, creases), creases
 
     @property
@@ -448,15 +449,15 @@ class _Simplification:
             options.while_waiting()
         return running.result()
 
-    def _separated_if_torn(self, made: TriMesh) -> tuple[TriMesh, bool]:
+    def _separated_if_torn(self, mesh: TriMesh) -> tuple[TriMesh, bool]:
         """Separate sheets where a closed mesh was torn; return the mesh, and whether it is closed and manifold."""
         # A closed result does for any input, so whether the input is closed is asked only for other results.
-        if _is_closed_manifold(made):
-            return made, True
-        if self.is_closed and _is_usable(made):
-            made = separate_sheets(made)  # most tears are two sheets that meet in an edge
-            return made, _is_closed_manifold(made)
-        return made, False
+        if _is_closed_manifold(mesh):
+            return mesh, True
+        if self.is_closed and _is_usable(mesh):
+            mesh = separate_sheets(mesh)  # most tears are two sheets that meet in an edge
+            return mesh, _is_closed_manifold(mesh)
+        return mesh, False
 
 
 def _is_usable(mesh: TriMesh) -> bool:

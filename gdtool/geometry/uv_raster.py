@@ -184,8 +184,8 @@ def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tup
     inside = ((at >= 0) & (at < size)).all(1)
     column, row = at[inside].astype(np.int64).T
     covered = np.pad(owner >= 0, 1).ravel()
-    place = (row + 1) * wide + column + 1
-    lone = ~np.any([covered[place + down + along] for down in (-wide, 0, wide) for along in (-1, 0, 1)], 0)
+    padded_idx = (row + 1) * wide + column + 1
+    lone = ~np.any([covered[padded_idx + down + along] for down in (-wide, 0, wide) for along in (-1, 0, 1)], 0)
     texel, first = np.unique((row * size + column)[lone], return_index=True)
     return texel, edges.half_face[rim[edge[inside][lone][first]]].astype(np.int32)
 

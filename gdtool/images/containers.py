@@ -41,7 +41,7 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
     elif head.startswith((b"GIF87a", b"GIF89a")):
         raise InputError(path, "is a GIF", "save one frame as PNG")
     elif head[:4] == b"RIFF" and head[8:12] == b"WEBP" and head[12:16] == b"VP8X" and head[20] & 2:
-        raise InputError(path, "is an animation", "save one frame as a still")
+        raise InputError(path, "is an animation", "save one frame as a still image")
 
 
 def suffix_of(head: bytes) -> str:
@@ -94,7 +94,7 @@ def _check_png(path: Path, file: BinaryIO) -> None:
                 "scale it down",
             )
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:
-            raise InputError(path, "is an animation", "save one frame as a still")
+            raise InputError(path, "is an animation", "save one frame as a still image")
         if kind == b"IEND":
             return
 

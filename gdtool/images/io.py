@@ -56,7 +56,7 @@ def read_image(path: str | Path) -> np.ndarray:
     with _plain_name(path) as name, _quiet() if suffix_of(head) == ".exr" else contextlib.nullcontext():
         try:
             return _read(path, name)
-        except UnicodeDecodeError:  # OpenImageIO's binding hands names and messages out of the file over as text
+        except UnicodeDecodeError:  # OpenImageIO's binding decodes names and messages from the file
             raise InputError(path, "is damaged (its header is not text where it should be)", COPY) from None
 
 
@@ -111,7 +111,7 @@ def _read(path: Path, name: str) -> np.ndarray:
             raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})", COPY)
         file_format = source.format_name()
         if source.seek_subimage(1, 0):
-            raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
+            raise InputError(path, "holds several images or an animation", "save the wanted one as a still image")
         source.geterror()
     finally:
         source.close()
@@ -149,7 +149,7 @@ def _check_spec(path: Path, spec) -> None:
     if any("cmyk" in space or "ycck" in space or "ycbcrk" in space for space in spaces) or "C" in spec.channelnames[:1]:
         raise InputError(path, "is in CMYK", "convert it to RGB")
     if spec.get_int_attribute("oiio:Movie", 0):
-        raise InputError(path, "is an animation", "save one frame as a still")
+        raise InputError(path, "is an animation", "save one frame as a still image")
 
 
 def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
@@ -171,8 +171,8 @@ def _channels(path: Path, names: list[str]) -> list[int]:
     A multi-channel file may hold others.
     """
     if {"R", "G", "B"} <= set(names):
-        wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
-        return [names.index(name) for name in wanted]
+        rgba_names = ["R", "G", "B", *(["A"] if "A" in names else [])]
+        return [names.index(name) for name in rgba_names]
     if 1 <= len(names) <= 4:
         return list(range(len(names)))
     if "Y" in names:
@@ -290,7 +290,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
         good = target.open(name, spec) and target.write_image(stored) and target.close()
         fact = target.geterror()
     try:
-        same = good and np.array_equal(_again(path), stored)
+        same = good and np.array_equal(_read_back(path), stored)
     except (InputError, ResourceError):
         same = False
     if not same:
@@ -299,12 +299,12 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
         raise OutputError(
             path,
             f"was not written whole "
-            f"({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
+            f"({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back differently'})",
             "free some space or choose another -o",
         )
 
 
-def _again(path: Path) -> np.ndarray:
+def _read_back(path: Path) -> np.ndarray:
     """Read the stored pixels, before alpha is divided."""
     import OpenImageIO as oiio
 

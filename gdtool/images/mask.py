@@ -115,7 +115,7 @@ def _salient(image: np.ndarray, subject: object, network: str | Path) -> np.ndar
 
     coverage = _without_specks(saliency(_encoded(image), network)).astype(np.float32)
     if not MIN_SUBJECT < (coverage > 0.5).mean() < MAX_SUBJECT:
-        raise InputError(subject, f"shows {network} no subject that stands off its background", _CURE)
+        raise InputError(subject, f"has no subject that {network} can tell from its background", _CURE)
     return coverage
 
 
@@ -147,7 +147,7 @@ def _segmented(image: np.ndarray, subject: object, warn: Callable[[str], None]) 
             )[0]
     coverage = np.clip(_without_specks(coverage), 0, 1)
     if (coverage > 0.5).mean() < MIN_SUBJECT:
-        raise InputError(subject, "shows no subject that stands off its background", _CURE)
+        raise InputError(subject, "shows no subject that stands out from its background", _CURE)
     if scale < 1:
         coverage = resize(coverage, (height, width), order=1)
     return np.clip(coverage, 0, 1).astype(np.float32)
@@ -173,7 +173,7 @@ def _labels(lab: np.ndarray, color: np.ndarray, subject: object, warn: Callable[
     distance = np.sqrt(np.square(difference * weight).sum(-1))
     labels = _trimap(distance, max(SUBJECT_DISTANCE, SUBJECT_NOISE * noise), noise)
     if not (labels == 1).any():
-        raise InputError(subject, "shows no subject that stands off its background", _CURE)
+        raise InputError(subject, "shows no subject that stands out from its background", _CURE)
     if float((labels == 1).mean()) > MAX_SUBJECT:
         raise InputError(subject, "is filled by its subject, or its background is not plain", _CURE)
     return labels

@@ -94,10 +94,10 @@ def check(inputs: Inputs, options: Options) -> None:
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Remesh one surface or mesh file; raise ResourceError where it takes much longer than --seconds."""
     from gdtool.remesh.limits import SECONDS_PER_QUAD
-    from gdtool.stages.limits import held_to
+    from gdtool.stages.limits import limited_to
 
     enough = max(round(SECONDS_PER_QUAD * options.faces), round(2 * options.seconds), 1)
-    with held_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
+    with limited_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
         _remesh(inputs, options, out)
 
 

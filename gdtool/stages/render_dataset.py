@@ -161,10 +161,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             model=generated,
             report=dataset.figures(scene, renderer, mask, lamps),
         )
-    _tell_skips(out, renderer, options, lamps)
+    _record_skips(out, renderer, options, lamps)
 
 
-def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: Lamps | None) -> None:
+def _record_skips(out: Output, renderer: Renderer, options: Options, lamps: Lamps | None) -> None:
     """Record what the scene and the options did not need."""
     from gdtool.shading.render.skipped_work import skipped_work
 

@@ -125,8 +125,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         folders, count = views_folders(inputs.on_disk, out.workspace), count_views_folders(inputs.on_disk)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     used = len(objects) - min(options.held_out, len(objects) - 1)
-    shown, objects = objects.part(slice(used, None)), objects.part(slice(used))
-    recorder = Recorder(out.workspace, shown, train_config.precision, options.tensorboard)
+    held_out_objects, objects = objects.part(slice(used, None)), objects.part(slice(used))
+    recorder = Recorder(out.workspace, held_out_objects, train_config.precision, options.tensorboard)
     distributed.start()
     run_options = RunOptions(
         options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device

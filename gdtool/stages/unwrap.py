@@ -58,10 +58,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Unwrap one mesh; raise ResourceError where it takes much longer than --seconds."""
-    from gdtool.stages.limits import held_to
+    from gdtool.stages.limits import limited_to
 
     cure = f"raise --seconds to {max(round(2 * options.seconds), 1)}, or run gdtool remesh with fewer --faces before"
-    with held_to(options.seconds, "--seconds", inputs.name, cure):
+    with limited_to(options.seconds, "--seconds", inputs.name, cure):
         _unwrap(inputs, options, out)
 
 

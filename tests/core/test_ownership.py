@@ -206,7 +206,7 @@ def test_clearing_does_not_follow_a_link():
 
 def test_a_file_of_the_users_at_the_locks_place_stays():
     Path(".out.lock").write_text("mine")
-    with pytest.raises(OutputError, match="in the way"), locked(Path("out")):
+    with pytest.raises(OutputError, match="lock file"), locked(Path("out")):
         pass
     assert Path(".out.lock").read_text() == "mine"
 

@@ -12,7 +12,7 @@ from gdtool.core.folder import Folder
 from gdtool.core.manifest import Manifest
 from gdtool.core.stage import Output
 from gdtool.folders.mesh import read_obj, write_obj
-from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
+from gdtool.folders.records import read_cameras, read_light, write_cameras, write_light
 from gdtool.folders.surface import Surface, read_surface, write_surface, write_surface_ply
 from gdtool.folders.views import Views, read_views, write_views
 from gdtool.geometry.meshes import QuadMesh
@@ -99,9 +99,9 @@ def test_light_comes_back():
         "amplitudes": np.ones((2, 3)),
         "fit_error": {"rms": 0.1},
     }
-    write_record(Path("l.json"), light)
-    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"])
-    assert read_record(Path("l.json"))["fit_error"] == {"rms": 0.1}
+    write_light(Path("l.json"), light)
+    assert np.array_equal(read_light(Path("l.json"))["axes"], light["axes"])
+    assert read_light(Path("l.json"))["fit_error"] == {"rms": 0.1}
 
 
 def test_surface_comes_back_and_missing_properties_have_their_defaults():

@@ -39,7 +39,7 @@ def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0
         origins, directions = rays(camera)
         hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
         both = (
-            hits.found
+            hits.is_hit
             & (views.mask[k].ravel() > 0)
             & (views.images["normal"][k].reshape(-1, 3) @ camera.backward >= facing)
         )

@@ -17,7 +17,7 @@ import numpy as np
 from gdtool.assets.gltf.schema import Accessor, Document, Sparse
 from gdtool.core.errors import InputError, from_os_error
 from gdtool.core.memory import require_memory
-from gdtool.core.names import shown, uri_path
+from gdtool.core.names import quoted, uri_path
 from gdtool.core.reading import bytes_of, require_regular_file
 
 SUPPORTED = {
@@ -155,7 +155,7 @@ class GltfFile:
         path = uri_path(self.path.parent, uri, self.path, f"the URI of {what}")
         if not path.exists():
             raise self.refuse(
-                f"{what} is in {shown(uri)}, which does not exist",
+                f"{what} is in {quoted(uri)}, which does not exist",
                 "put that file beside the model or embed it in a .glb",
             )
         require_regular_file(path)
@@ -167,8 +167,8 @@ class GltfFile:
             record = self.item(self.document.buffers, index, "buffer")
             content: bytes | memoryview
             if record.uri is not None:
-                place = self.resolve(record.uri, f"buffer {index}")
-                content = self._read_buffer(place, record.byte_length, index) if isinstance(place, Path) else place
+                target = self.resolve(record.uri, f"buffer {index}")
+                content = self._read_buffer(target, record.byte_length, index) if isinstance(target, Path) else target
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
@@ -292,4 +292,4 @@ class GltfFile:
 
 def printed(name: str) -> str:
     """Format a name from a file for a message: as it is where it is short and printable, else escaped and cut."""
-    return name if name.isprintable() and len(name) <= 80 else shown(name)
+    return name if name.isprintable() and len(name) <= 80 else quoted(name)

@@ -134,8 +134,8 @@ def _metallic(diffuse: np.ndarray, specular: np.ndarray) -> np.ndarray:
     f0 m² + (k - 2 f0 + s) m + (f0 - s) = 0 with k = d (1 - max s) / (1 - f0). Returns its root in [0, 1].
     """
     f0, d, s = _DIELECTRIC_F0, _brightness(diffuse), _brightness(specular)
-    kept = d * (1 - specular.max(-1)) / (1 - f0)
-    b, c = kept - 2 * f0 + s, f0 - s
+    k = d * (1 - specular.max(-1)) / (1 - f0)
+    b, c = k - 2 * f0 + s, f0 - s
     root = (-b + np.sqrt(np.maximum(b * b - 4 * f0 * c, 0))) / (2 * f0)
     return np.where(s <= f0, 0.0, np.clip(root, 0, 1)).astype(diffuse.dtype)
 

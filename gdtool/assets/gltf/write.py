@@ -41,7 +41,7 @@ def write_glb(
         raise from_os_error(error, path) from None
     if not whole:
         raise OutputError(
-            path, "was not written whole (it reads back otherwise)", "free some space or choose another -o"
+            path, "was not written whole (it reads back differently)", "free some space or choose another -o"
         )
 
 

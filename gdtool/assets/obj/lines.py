@@ -113,7 +113,7 @@ def parse_each(text: str, path: Path) -> ObjLines:
                 names.add_line(words, line)
         except (ValueError, IndexError, OverflowError) as error:
             raise InputError(
-                path, f"line {number} is not what OBJ says ({str(error)[:120]})", "correct that line or export it again"
+                path, f"line {number} is not valid OBJ ({str(error)[:120]})", "correct that line or export it again"
             ) from None
     return ObjLines(
         np.array(vertices, np.float64).reshape(-1, 3),

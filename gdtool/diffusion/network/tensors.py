@@ -78,7 +78,7 @@ def pretrained_part(config: ModelConfig, part: str) -> Path:
 
 def require_weights_fit(size: int, subject: object, what: str) -> None:
     """Raise ResourceError when `size` bytes are more than all the memory that this process may have."""
-    most = memory.most_held() / memory.SHARE
+    most = memory.max_input_bytes() / memory.SHARE
     if size > most:
         raise ResourceError(
             subject,

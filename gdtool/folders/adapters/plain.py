@@ -92,10 +92,10 @@ def read(folder: Path) -> Pictures:
 
 def _find(folder: Path, domain: str, view: str) -> Path | None:
     """Find the picture of a view in a domain; None where there is none."""
-    places = [f"{domain}/"] + ([""] if domain == "color" else [])
-    for place in places:
+    prefixes = [f"{domain}/"] + ([""] if domain == "color" else [])
+    for prefix in prefixes:
         for suffix in _SUFFIXES:
-            path = path_inside(folder, f"{place}{view}{suffix}", folder / "cameras.json", "picture")
+            path = path_inside(folder, f"{prefix}{view}{suffix}", folder / "cameras.json", "picture")
             if is_readable(path):
                 return path
     return None
