@@ -233,7 +233,7 @@ def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
     if not pid:
         os.setuid(65534)
         (error,) = run("cat.png", output=made)
-        right = isinstance(error, OutputError) and "closed to writing" in str(error)
+        right = isinstance(error, OutputError) and "not writable" in str(error)
         os._exit(0 if right else 1)
     assert os.waitpid(pid, 0)[1] == 0
     assert sorted(path.name for path in Path().iterdir()) == ["cat.png", "out"]

@@ -26,7 +26,7 @@ from gdtool.folders.views import read_views
 from gdtool.images import io as image_io
 from gdtool.images.io import read_image, write_exr, write_png
 from gdtool.shading.lights.load import load_environment
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, quad
 from tests.conftest import ROOT
 from tests.fields.shapes import torus, views_folder
 from tests.fields.shapes import views_of as seen

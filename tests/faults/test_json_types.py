@@ -62,7 +62,7 @@ def test_a_gltf_of_wrong_types_is_refused_with_the_place(tmp_path, part):
     "name", [f"TEXCOORD_{LONG}", "TEXCOORD_²", "TEXCOORD_\n"], ids=["long", "superscript", "line break"]
 )
 def test_a_malformed_attribute_name_is_no_uv_set(tmp_path, name):
-    from tests.assets.gltf_files import quad
+    from tests.assets.gltf.files import quad
 
     builder = quad()
     attributes = builder.document["meshes"][0]["primitives"][0]["attributes"]

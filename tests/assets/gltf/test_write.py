@@ -16,7 +16,7 @@ from gdtool.assets.gltf.write import glb_bytes, write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError
 
-TOOLS = Path(__file__).parents[1] / "tools"
+TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def pixels(channels: int, seed: int = 0) -> np.ndarray:

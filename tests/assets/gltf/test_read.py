@@ -11,7 +11,7 @@ from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.images.io import encode_png
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, quad
 
 
 def area_vector(scene) -> np.ndarray:
