@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    """Let children import this file."""
+    """Set PYTHONPATH so that children can import this file."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
@@ -26,7 +26,7 @@ def double(array, noise=""):
 
 
 def of_own_type(arrays):
-    """Tell which arrays have a type object of numpy's own, and return the arrays too."""
+    """Tell which arrays have one of numpy's own type objects, not a copy of it; returns the arrays too."""
     return [array.dtype is np.dtype(array.dtype.str) for array in arrays], arrays
 
 

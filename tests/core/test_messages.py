@@ -254,7 +254,7 @@ def test_every_error_has_a_cure():
     assert not lacking, f"say what removes the fault: {lacking}"
 
 
-def test_no_function_has_a_cure_of_nothing():
+def test_no_function_has_an_empty_default_cure():
     """A parameter `cure` has no default, or one that is not empty; with None the function supplies the text."""
     lacking = [
         f"{file}:{function.lineno} {function.name}"

@@ -49,7 +49,7 @@ def random_views(size=16):
     return Views(cameras, images, mask, light)
 
 
-def test_views_come_back_within_their_quantisation():
+def test_views_are_read_as_written_within_their_quantisation():
     views = random_views()
     folder = written("views", lambda out: write_views(out, views, exposure=2.0))
     assert folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic")
@@ -73,7 +73,7 @@ def test_views_of_another_size_than_their_camera_are_refused():
         read_views(folder)
 
 
-def test_cameras_come_back_and_bad_ones_are_refused():
+def test_cameras_are_read_as_written_and_bad_ones_refused():
     cameras = [camera_at(20, 10, name="a", size=8, fov_degrees=40), *rig("wonder3d", 8)]
     write_cameras(Path("c.json"), cameras)
     for before, after in zip(cameras, read_cameras(Path("c.json")), strict=True):
@@ -92,7 +92,7 @@ def test_cameras_come_back_and_bad_ones_are_refused():
             read_cameras(Path("bad.json"))
 
 
-def test_light_comes_back():
+def test_light_is_read_as_written():
     light = {
         "axes": np.eye(3)[:2],
         "sharpness": np.array([0.0, 5.0]),
@@ -104,7 +104,7 @@ def test_light_comes_back():
     assert read_light(Path("l.json"))["fit_error"] == {"rms": 0.1}
 
 
-def test_surface_comes_back_and_missing_properties_have_their_defaults():
+def test_surfaces_are_read_as_written_and_missing_properties_get_defaults():
     triangles = triangulated(QUADS)[0]
     n = len(CUBE)
     surface = Surface(
@@ -150,7 +150,7 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
         read_surface(folder)
 
 
-def test_quads_come_back_with_their_texture_coordinates():
+def test_quads_are_read_as_written_with_texture_coordinates():
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
     mesh = QuadMesh(CUBE, QUADS, uv, np.tile(np.arange(4, dtype=np.int32), (6, 1)))
     write_obj(Path("m.obj"), mesh)

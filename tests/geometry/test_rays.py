@@ -1,4 +1,4 @@
-"""Ray queries: distances, barycentric weights and visibility of shapes with analytic answers."""
+"""Cast rays at shapes with analytic distances, barycentric weights and visibility."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Means, gains and guided filtering over the covered part of a picture."""
+"""Compute means, gains and guided filters over the covered part of a picture."""
 
 import numpy as np
 import pytest

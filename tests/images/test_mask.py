@@ -69,7 +69,7 @@ def test_opaque_alpha_is_segmented():
     assert overlap(foreground(np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])), truth) > 0.95
 
 
-def test_a_given_mask_comes_before_everything():
+def test_a_mask_argument_comes_first():
     image, _ = scene()
     mask = np.zeros(image.shape[:2], np.uint8)
     mask[10:20, 10:20] = 255

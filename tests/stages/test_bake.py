@@ -207,7 +207,7 @@ def test_maps_that_do_not_fit_are_refused_with_the_figure(monkeypatch):
         require_map_memory("ring", 4096)
 
 
-def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):
+def test_broken_faces_do_not_stop_the_bake(gdtool, chain, tmp_path):
     mesh = torus_atlas()
     faces, uvs = mesh.faces.copy(), mesh.face_uvs.copy()
     faces[3, 1] = faces[3, 0]  # two corners in one place
@@ -254,7 +254,7 @@ def test_bad_input_exits_with_one_line(gdtool, chain, tmp_path, fault, code, mes
     assert not (tmp_path / "low.asset" / "asset").exists()
 
 
-def test_overlapping_texture_coordinates_are_told(gdtool, chain, tmp_path):
+def test_overlapping_texture_coordinates_are_reported(gdtool, chain, tmp_path):
     mesh = torus_atlas()
     half = len(mesh.faces) // 2
     folded = mesh.face_uvs.copy()
@@ -331,7 +331,7 @@ def test_size_follows_the_detail_of_the_source(gdtool, chain, tmp_path):
     assert open_folder(tmp_path / "second").content.size == 1024
 
 
-def test_emission_comes_along(gdtool, chain, tmp_path):
+def test_emission_is_baked(gdtool, chain, tmp_path):
     from dataclasses import replace
 
     from gdtool.assets.gltf.write import write_glb

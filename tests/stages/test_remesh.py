@@ -140,7 +140,7 @@ def test_symmetry_is_kept_when_asked(gdtool, tmp_path):
     assert 0 < (other == np.arange(len(other))).sum() < 200
 
 
-def test_symmetry_that_is_not_there_is_left_out_and_said(gdtool, tmp_path):
+def test_a_missing_symmetry_is_ignored_with_a_message(gdtool, tmp_path):
     vertices, faces = sphere(24)
     vertices[vertices[:, 0] > 0.3] *= [1.3, 1, 1]
     write_obj(tmp_path / "egg.obj", vertices, faces)

@@ -252,7 +252,7 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
         assert gdtool("render-dataset", *sources, *fast, "--shard", wrong).returncode == 2
 
 
-def test_goes_on_after_a_kill(gdtool, box, tmp_path):
+def test_a_killed_run_goes_on(gdtool, box, tmp_path):
     """Killed while it renders the second of three: the first is kept, no half-written folder is left or listed."""
     for name in "abc":
         (tmp_path / f"{name}.obj").write_text(BOX)
@@ -333,7 +333,7 @@ def test_either_reflection_model(gdtool, box, tmp_path):
         assert difference.mean() < 0.1, domain
 
 
-def test_without_ray_or_its_cluster_that_is_said(gdtool, box, monkeypatch):
+def test_a_missing_ray_or_cluster_is_reported(gdtool, box, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     done = gdtool("render-dataset", box, *FAST, "--ray", "local")
     assert done.returncode == 5

@@ -126,7 +126,7 @@ def test_a_compiled_network_gives_the_same(gdtool, picture, tiny_model, tmp_path
 
 
 @pytest.mark.slow
-def test_without_a_compiler_that_is_said(gdtool, picture, tiny_model, monkeypatch, tmp_path):
+def test_a_missing_compiler_is_reported(gdtool, picture, tiny_model, monkeypatch, tmp_path):
     monkeypatch.setenv("CXX", "/bin/false")
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     result = sample(gdtool, "ball.png", "--model", tiny_model, "--compile", "-o", "out")
@@ -226,7 +226,7 @@ def test_a_picture_unlike_the_training_is_sampled_with_a_warning(gdtool, picture
     assert "width over height of the subject is 1.09, in training 2 to 3" in result.stderr
 
 
-def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_model, tmp_path):
+def test_a_result_that_the_model_is_unsure_of_gets_a_warning(gdtool, picture, tiny_model, tmp_path):
     model = shutil.copytree(tiny_model, tmp_path / "model")
     for name, high in (("sure", 1e6), ("unsure", 0.0)):
         (model / "pictures.json").write_text(json.dumps({"outline_blur": {"low": 0.0, "high": high}}))

@@ -46,7 +46,7 @@ def test_atlas_of_quads(gdtool, tmp_path, ring):
     assert gdtool("validate", "ring.asset/atlas").returncode == 0
 
 
-def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
+def test_valid_texture_coordinates_are_kept_without_redo(gdtool, tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.1, 0.9], [0.4, 0.9], [0.4, 0.6], [0.1, 0.6]])
     quad = np.array([[0, 1, 2, 3]], np.int32)
@@ -58,7 +58,7 @@ def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
     assert content(tmp_path / "leaf.asset/atlas")["coverage"] > 0.9
 
 
-def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
+def test_mirrored_coordinates_are_kept_with_a_warning(gdtool, tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.4, 0.9], [0.1, 0.9], [0.1, 0.6], [0.4, 0.6]])
     quad = np.array([[0, 1, 2, 3]], np.int32)
@@ -70,7 +70,7 @@ def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
     assert "mirrored" not in gdtool("unwrap", "leaf.obj", "--redo").stderr
 
 
-def test_a_short_time_is_kept_and_told(gdtool, tmp_path, ring):
+def test_a_short_time_limit_is_met_and_reported(gdtool, tmp_path, ring):
     run = gdtool("unwrap", "ring.obj", "--size", 512, "--seconds", 0.01)
     assert run.returncode == 0, run.stderr
     found = content(tmp_path / "ring.asset/atlas")

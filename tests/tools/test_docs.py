@@ -1,4 +1,4 @@
-"""What the documents show can be typed: every command they name exists, with every option they give it."""
+"""Check that every command that the documents name exists, with every option that they give it."""
 
 import importlib
 import re
