@@ -71,7 +71,7 @@ def read_json(path: Path) -> Any:
 def parse_json(content: bytes | str, subject: object) -> Any:
     """Parse JSON strictly: lists, dicts, strings, finite floats, 64-bit integers, booleans and None.
 
-    Raises InputError that names subject and the fault, for: text that is not JSON; a repeated key; NaN and infinities;
+    Raises InputError that names subject and the place, for: text that is not JSON; a repeated key; NaN and infinities;
     numbers beyond float64 or 64 bits; nesting beyond Python's parser (some 1000 levels); strings with lone surrogates
     that stand for no byte of a file name.
     """

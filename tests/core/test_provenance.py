@@ -81,12 +81,12 @@ def test_a_path_through_a_linked_folder_records_where_things_really_lie():
     folder = run(STAGE, "cat.png", "link/out")
     assert folder.manifest.inputs[0].path == "../../../cat.png"
     assert Path(find_source(folder, CURE)).read_bytes() == b"cat"
-    again = run(NEXT, "link/out", "link/second")
-    assert [one.manifest.digest for one in ancestors(again, CURE)] == [folder.manifest.digest]
+    second = run(NEXT, "link/out", "link/second")
+    assert [ancestor.manifest.digest for ancestor in ancestors(second, CURE)] == [folder.manifest.digest]
     moved = Path("b/c/d")
     moved.mkdir(parents=True)
     Path("disk").rename("b/c/d/disk")  # a chain that moves as a whole is whole
-    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
+    assert [ancestor.manifest.digest for ancestor in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
         folder.manifest.digest
     ]
 

@@ -269,6 +269,6 @@ def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
     from gdtool.core.second_inputs import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 
-    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
-    assert found.kind == "model"
-    assert found.name == "default"
+    model = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
+    assert model.kind == "model"
+    assert model.name == "default"

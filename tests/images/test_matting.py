@@ -37,11 +37,11 @@ def network(tmp_path):
 
 def test_a_network_cuts_out_what_it_finds_on_any_background(network):
     image, truth = busy_scene(size=480)
-    told = []
-    mask = foreground(image, None, "leaf.png", told.append, network)
+    warned = []
+    mask = foreground(image, None, "leaf.png", warned.append, network)
     assert mask.shape == truth.shape
     assert mask.dtype == np.float32
-    assert not told
+    assert not warned
     assert overlap(mask, truth) > 0.97
 
 

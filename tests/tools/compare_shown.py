@@ -74,30 +74,37 @@ def main() -> None:
     parser.add_argument("--peers-python", type=Path)
     parser.add_argument("--env", default="mid")
     parser.add_argument("--keep", type=Path, help="folder for the pictures")
-    asked = parser.parse_args()
-    asset = asked.asset.resolve()
+    arguments = parser.parse_args()
+    asset = arguments.asset.resolve()
     with tempfile.TemporaryDirectory() as folder:
-        place = asked.keep or Path(folder)
+        place = arguments.keep or Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         place = place.resolve()
         light = place / "light.exr"
-        write_exr(light, studio(asked.env, 0, fit=False)[0].image.astype(np.float32))
-        own, three = [sys.executable, HERE / "show_in_gdtool.py", asset], ["node", HERE / "show_in_three.mjs", asset]
-        pairs = {"three.js, base color": (three, "unlit", "unlit"), "three.js, lit": (three, light, asked.env)}
-        if asked.peers_python:
-            pairs["Blender, base color"] = ([asked.peers_python, HERE / "show_in_blender.py", asset], "unlit", "unlit")
-        found: dict[str, float | str] = {}
+        write_exr(light, studio(arguments.env, 0, fit=False)[0].image.astype(np.float32))
+        gdtool_command, three = (
+            [sys.executable, HERE / "show_in_gdtool.py", asset],
+            ["node", HERE / "show_in_three.mjs", asset],
+        )
+        pairs = {"three.js, base color": (three, "unlit", "unlit"), "three.js, lit": (three, light, arguments.env)}
+        if arguments.peers_python:
+            pairs["Blender, base color"] = (
+                [arguments.peers_python, HERE / "show_in_blender.py", asset],
+                "unlit",
+                "unlit",
+            )
+        figures: dict[str, float | str] = {}
         for name, (command, mode, own_mode) in pairs.items():
             ours, theirs = (
-                picture(own, place / f"gdtool_{own_mode}.png", own_mode),
+                picture(gdtool_command, place / f"gdtool_{own_mode}.png", own_mode),
                 picture(command, place / f"{name}.png", mode),
             )
             if isinstance(ours, str) or isinstance(theirs, str):
-                found[name] = ours if isinstance(ours, str) else theirs
+                figures[name] = ours if isinstance(ours, str) else theirs
                 continue
             where = inner(ours[..., 3]) & inner(theirs[..., 3])
-            found[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
-    print(json.dumps(found))
+            figures[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":

@@ -278,7 +278,7 @@ def disturbed(views: Path, folder: Path, rng) -> None:
 
 
 def nerf(views: Path, folder: Path, names: list[str]) -> None:
-    """Write a folder with transforms.json; orthographic pictures stand in for perspective ones, which are not needed."""
+    """Write a folder with transforms.json; orthographic pictures stand in for perspective ones."""
     import numpy as np
 
     folder.mkdir()
@@ -418,13 +418,15 @@ class Comparison:
         self._fields(str(relative), self._plain(before), self._plain(after))
 
     def _plain(self, value):
-        """Return a parsed JSON with its sentences replaced, without the entries on how a run went or which version ran."""
+        """Return a parsed JSON with its sentences replaced, without entries on the run and the version."""
         if isinstance(value, dict):
             return {
-                key: self._plain(one) for key, one in value.items() if key not in NOT_COMPARED and not TIMES.search(key)
+                key: self._plain(item)
+                for key, item in value.items()
+                if key not in NOT_COMPARED and not TIMES.search(key)
             }
         if isinstance(value, list):
-            return [self._plain(one) for one in value]
+            return [self._plain(item) for item in value]
         return (
             BUNDLED_MODEL.sub("gdtool/models/", self.sentences.translated(value)) if isinstance(value, str) else value
         )
