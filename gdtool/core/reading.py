@@ -88,9 +88,9 @@ def parse_json(content: bytes | str, subject: object) -> Any:
         raise InputError(subject, f"is not JSON (byte {error.start} is not UTF-8)", "save it as UTF-8") from None
     except json.JSONDecodeError as error:
         raise InputError(subject, f"is not JSON: {error.msg} in line {error.lineno}", "correct that line") from None
-    fault = _unfit_string(value)
-    if fault:
-        raise InputError(subject, fault, "correct that entry")
+    string_fault = _unfit_string(value)
+    if string_fault:
+        raise InputError(subject, string_fault, "correct that entry")
     return value
 
 

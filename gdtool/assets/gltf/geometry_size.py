@@ -120,7 +120,7 @@ def _primitive_size(file: GltfFile, primitive: Primitive) -> _PrimitiveSize | No
         vertices=vertices,
         faces=faces,
         names=names,
-        kept=vertices * sum(_width(name) for name in names),
+        scene_bytes=vertices * sum(_width(name) for name in names),
         temporary=count * components * _COMPONENT_BYTES + corners * _CORNER_BYTES,
         skin=count * _SKIN_BYTES,
     )
