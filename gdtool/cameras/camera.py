@@ -118,9 +118,9 @@ def rig(name: str, size: int) -> list[Camera]:
 def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Compute the rays through pixels: origins and unit directions in the world, float64.
 
-    pixels (..., 2): (x, y) in pixel units; None for all pixel centres, shape (h, w). Orthographic origins lie on the
-    camera plane, so that the distance along an orthographic ray is the depth. The arrays lie in memory component by
-    component.
+    pixels (..., 2): (x, y) in pixel units; None for all pixel centres, shape (h, w). The results have the shape (...,
+    3). Orthographic origins lie on the camera plane, so that the distance along an orthographic ray is the depth. Each
+    component is contiguous in memory.
     """
     if pixels is None:
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

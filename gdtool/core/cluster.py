@@ -101,7 +101,7 @@ def _next(ray: Any, waiting: dict[Any, str]) -> Any:
 
 
 def _work_in_folder(folder: str, work: Callable[[str], Any], text: str) -> Any:
-    """Run work in the driver's folder, to which relative paths refer."""
+    """Run work in `folder`, the working folder of the process that submitted the task: relative paths refer to it."""
     from gdtool.core import log
 
     log.level = log.QUIET

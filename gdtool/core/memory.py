@@ -17,8 +17,8 @@ SHARE = 0.5
 def max_input_bytes() -> int:
     """Return the most bytes that reading one input may take.
 
-    This is the share SHARE of the machine's memory, or of the limit on the address space (RLIMIT_AS) where that is
-    smaller.
+    This is the share SHARE (one half) of the machine's memory, or of the limit on the address space (RLIMIT_AS) where
+    that is smaller.
     """
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:

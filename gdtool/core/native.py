@@ -32,7 +32,10 @@ def imported(module: str) -> ModuleType:
 
 
 def imported_if_installed(module: str) -> ModuleType | None:
-    """Import a module as imported() does; None where its package is not installed and something else can replace it."""
+    """Import a module as imported() does, or return None where its package is not installed.
+
+    It is for packages that the caller can do without.
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

@@ -92,7 +92,7 @@ def refuse_index(root: Path) -> None:
 
 
 def _manifest_to_replace(place: Path, present: list[str]) -> Manifest:
-    """Read the manifest of a folder that a run would replace. Raises UsageError where there is none of gdtool's."""
+    """Read the manifest of a folder that a run would replace. Raises UsageError where gdtool wrote none there."""
     if MANIFEST not in present:
         raise UsageError(place / present[0], "would be deleted, and gdtool did not write that folder", CURE)
     try:

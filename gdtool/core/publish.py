@@ -83,7 +83,7 @@ def _beside(target: Path, key: str, use: str) -> Path:
 
 
 def _leftovers(target: Path, *uses: str) -> list[Path]:
-    """List the folders that runs of this output, and of no other, have left beside it."""
+    """List the hidden folders beside the target that runs of this output have left; uses: "partial", "old" or "work"."""
     pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
     return sorted(
         path

@@ -96,7 +96,10 @@ def library_folder(name: str) -> str:
 
 
 def map_name(words: list[str]) -> tuple[str, str | None]:
-    """Return the name and the -imfchan of a texture statement, without the other options."""
+    """Return the file name of a texture statement, and the value of its option -imfchan (a channel) or None.
+
+    Its other options are dropped.
+    """
     channel, i = None, 0
     while i < len(words) and words[i] in _OPTION_WORDS:
         count = _OPTION_WORDS[words[i]]
@@ -192,7 +195,7 @@ def _obj_files(path: Path) -> list[Path]:
 
 
 def _without_quotes(name: str) -> str:
-    """Return a name without quotes, with forward slashes; of an absolute one the last part."""
+    """Return a name without quotes and with forward slashes; of an absolute name only the last part."""
     plain = name.strip().strip('"').replace("\\", "/")
     return plain.rsplit("/", 1)[-1] if plain.startswith("/") or plain[1:3] == ":/" else plain
 

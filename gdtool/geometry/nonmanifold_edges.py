@@ -77,7 +77,7 @@ def _wedge_pairs(mesh: TriMesh, edges: Edges) -> np.ndarray:
 def _split_pairs(mesh: TriMesh, near: np.ndarray, edges: Edges, pairs: np.ndarray) -> TriMesh:
     """Add a vertex in the middle of each pair of half edges (k, 2), and cut its two triangles there.
 
-    near (n,): the faces of the mesh that `edges` is of.
+    edges: of the faces `near` (n,) of the mesh only; pairs index into its half edges.
     """
     vertices, faces = mesh.vertices, mesh.faces.copy()
     touched: set[int] = set()

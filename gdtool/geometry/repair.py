@@ -143,7 +143,7 @@ def _repair_structure(mesh: TriMesh, extent: float, repairs: dict[str, int | boo
 
 
 def _note(repairs: dict[str, int | bool], name: str, count: int) -> None:
-    """Enter a kind of repair where it was made."""
+    """Record the number of repairs of one kind in `repairs`, where there were any."""
     if count:
         repairs[name] = int(count)
 

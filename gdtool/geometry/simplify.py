@@ -428,7 +428,7 @@ class _Simplification:
 
     @property
     def _most_finished_faces(self) -> float:
-        """Triangles that a finished quick collapse leaves at most."""
+        """Most triangles that a quick collapse leaves where it finishes."""
         return _UNFINISHED_FACTOR * self.target_faces + _UNFINISHED_FACES
 
     def _run_child(self, call: CollapseCall, crease_degrees: float) -> ChildResult:

@@ -5,9 +5,9 @@ WebDataset's naming. It writes a model folder for sample-views: weights, configu
 images.
 
 Use it to train the small configuration on a processor, to go on from a model you have (--start; with --size, at a
-larger size), or, with --preset paper, to extend Stable Diffusion to six domains. Killed at any time, the same command
-goes on where it was. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits
-the weights as well). --plan predicts the cost of a configuration, without data.
+larger size), or, with --preset paper, to extend Stable Diffusion to six domains. A training may be killed at any time:
+the same command resumes it. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1
+splits the weights as well). --plan predicts the cost of a configuration, without data.
 
 Example:
   gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
