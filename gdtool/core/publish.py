@@ -83,7 +83,10 @@ def _beside(target: Path, key: str, use: str) -> Path:
 
 
 def _leftovers(target: Path, *uses: str) -> list[Path]:
-    """List the hidden folders beside the target that runs of this output have left; uses: "partial", "old" or "work"."""
+    """List the hidden folders beside the target that its runs have left.
+
+    uses: "partial", "old" or "work", the last part of their names.
+    """
     pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
     return sorted(
         path
