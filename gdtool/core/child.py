@@ -232,7 +232,7 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
 
 
 def _limit_memory(megabytes: int) -> None:
-    """Let the address space of this process grow by so many megabytes, and no more."""
+    """Limit how much the address space of this process may still grow, in MB."""
     import resource
 
     with Path("/proc/self/statm").open() as file:

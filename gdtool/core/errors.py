@@ -81,8 +81,8 @@ _BAD_NAMES = {
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
     """Turn an OSError into an error for the user; its subject is the error's file name, else `subject`.
 
-    InputError stands for names that are too long or lead in a circle, ResourceError for limits of the machine,
-    OutputError for all else.
+    Names that are too long and links that lead in a circle give InputError, limits of the machine ResourceError, all
+    else OutputError.
     """
     fact = error.strerror or str(error) or type(error).__name__
     fact, named = fact[0].lower() + fact[1:], error.filename or subject

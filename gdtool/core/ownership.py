@@ -1,7 +1,7 @@
-"""Decide whether a folder at the place of an output may be replaced.
+"""Decide whether a run may replace the folder at the path of its output, which may hold somebody's work.
 
-It may hold somebody's work. It is replaced only if it is empty, or a folder of the same kind that a stage wrote, with
-no file besides those that its manifest lists, each as it was written. `--force` does not change that.
+It may where the folder is empty. It may also where a stage wrote the folder, with the same kind, and every file in it
+is listed by its manifest and unchanged. `--force` does not change that.
 """
 
 from __future__ import annotations
@@ -53,9 +53,10 @@ def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
 
 
 def refuse_loss(place: Path, kind: str) -> None:
-    """Raise UsageError, naming the file, where a result of this kind would replace something of the user's.
+    """Raise UsageError, naming the file, where a result of this kind would replace a file of the user's.
 
-    Reads every listed file, to compare its digest.
+    That is a file which gdtool did not write, or which was changed since. Reads every listed file, to compare its
+    digest.
     """
     if not os.path.lexists(place):
         return

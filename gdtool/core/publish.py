@@ -117,7 +117,7 @@ def clear_workspaces(target: Path) -> None:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of gdtool's as far as the system permits; a link is not followed.
+    """Remove a folder that gdtool wrote, as far as the system permits; a link is not followed.
 
     Folders that a umask has left without permissions are removed as well.
     """

@@ -41,10 +41,10 @@ _OPTION_WORDS = {
 def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
     """Return the path that a name in an .obj or .mtl stands for.
 
-    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes count as
-    slashes, and of an absolute name only the last part is used. subject, what: as in path_inside(). Returns None for an
-    empty name or ".", by which exporters mean no file. Raises InputError for a name that leads more than one folder
-    above the model's, links followed.
+    model: the .obj. name: backslashes count as slashes, and of an absolute name only the last part is used. subject:
+    the file that holds the name, and what: the thing that it names, both for messages. folder: the folder that the name
+    is relative to, itself relative to the model's folder. Returns None for an empty name or ".", by which exporters
+    mean no file. Raises InputError for a name that leads more than one folder above the model's, links followed.
     """
     plain = _without_quotes(name)
     if plain in ("", "."):

@@ -37,7 +37,7 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 @dataclass(frozen=True)
 class Settings:
-    """Hold how to run, as against what to make: none of it enters the key."""
+    """Hold settings of how to run, which do not change what is made: none of them enters the key."""
 
     output: Path | None = None
     several: bool = False

@@ -119,7 +119,7 @@ def signed_volume(mesh: TriMesh) -> float:
 
 
 def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return the connected piece (f,) of each face, from 0; faces that share a vertex are of one piece."""
+    """Return the connected piece (f,) of each face, from 0; faces that share a vertex belong to one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

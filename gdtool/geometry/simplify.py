@@ -155,7 +155,7 @@ def break_coplanarity(mesh: TriMesh) -> np.ndarray:
 
 
 def _nearly_coplanar(mesh: TriMesh) -> np.ndarray:
-    """Return (v,) bool: vertices all of whose faces lie in one plane but for rounding."""
+    """Return (v,) bool: vertices all of whose faces lie in one plane, except for rounding errors."""
     vertices, faces = mesh.vertices, mesh.faces
     single = TriMesh(vertices.astype(np.float32).astype(np.float64), faces)
     normals, corners = face_normals(single)[0].T, np.ascontiguousarray(faces.T, np.intp)

@@ -183,7 +183,7 @@ def corner_fans(
 
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
+    """Return the number of pieces and the piece (f,) of each face; faces that share an edge belong to one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

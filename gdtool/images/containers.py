@@ -45,9 +45,10 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
 
 
 def suffix_of(head: bytes) -> str:
-    """Return the suffix that the first bytes of an image stand for.
+    """Return the suffix of the format that the first bytes of an image belong to.
 
-    OpenImageIO tries the suffix's format first, and only then says why that fails.
+    Under a name with this suffix OpenImageIO tries that format first. Only then does its message say why decoding
+    fails.
     """
     if head[:4] == b"RIFF":
         return ".webp" if head[8:12] == b"WEBP" else ""

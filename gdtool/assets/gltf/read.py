@@ -83,7 +83,9 @@ def _joined(file: GltfFile, parts: list[MeshPart]) -> Scene:
 
 
 def _flat_shaded(part: MeshPart) -> MeshPart:
-    """Give each face three vertices of its own with the face's normal, as glTF asks where normals are missing."""
+    """Give each face three vertices that it does not share, with the face's normal, as glTF asks where normals are
+    missing.
+    """
     from gdtool.geometry.normals import face_normals
 
     corner = part.faces.reshape(-1)
