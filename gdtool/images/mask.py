@@ -12,6 +12,7 @@ from gdtool.core.errors import InputError
 from gdtool.images.color import rgba, srgb_from_linear, unit_range
 
 WORKING_SIDE = 384  # pixels; larger pictures are segmented at this size
+_MIN_WORKING_SIDE = 8  # pixels, of the shorter side of a very long picture at that size
 # Shares of the picture that a subject may cover: less is a speck, with more there is too little background to judge by.
 MIN_SUBJECT, MAX_SUBJECT = 0.002, 0.95
 # A pixel is the subject from this distance to the background on, in Lab units: the larger of a fixed distance and a
@@ -132,7 +133,7 @@ def _segmented(image: np.ndarray, subject: object, warn: Callable[[str], None]) 
     color = _encoded(image)
     height, width = color.shape[:2]
     scale = min(1.0, WORKING_SIDE / max(height, width))
-    small = (max(8, round(height * scale)), max(8, round(width * scale)))
+    small = (max(_MIN_WORKING_SIDE, round(height * scale)), max(_MIN_WORKING_SIDE, round(width * scale)))
     if scale < 1:
         color = resize(color, small, order=1, anti_aliasing=True)
     lab = rgb2lab(color)
