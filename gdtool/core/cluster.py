@@ -83,12 +83,12 @@ def _task_slots(ray: Any, cores: int) -> int:
 
 
 def _any_done(ray: Any, waiting: dict[Any, str]) -> bool:
-    """Tell whether a task is done, without waiting."""
+    """Tell, without waiting, whether a task has ended."""
     return bool(waiting) and bool(ray.wait(list(waiting), num_returns=1, timeout=0)[0])
 
 
 def _next(ray: Any, waiting: dict[Any, str]) -> Any:
-    """Wait for a task; returns its result, or a GdtoolError where its worker died."""
+    """Wait for a task to end; returns its result, or a GdtoolError where its worker process died."""
     (done,), _ = ray.wait(list(waiting), num_returns=1)
     text = waiting.pop(done)
     try:

@@ -115,7 +115,7 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
     cosine = (normals[face_idx] * true_normals[near_true_idx]).sum(1)
     true_cosine = (true_normals[true_idx] * normals[near_idx]).sum(1)
 
-    out = _both_ways(accuracy, completeness, cosine, true_cosine, options.threshold)
+    out = _two_way_figures(accuracy, completeness, cosine, true_cosine, options.threshold)
     out["hausdorff"] = float(max(accuracy.max(), completeness.max()))
     if is_closed(truth):
         out["iou"] = volume_iou(mesh, truth, options.cells)
@@ -124,7 +124,7 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
         true_part = _visible_in_unit(true_points, true_normals[true_idx], truth, options.cameras, extent)
         out["seen_share"] = float(true_part.mean())
         if part.any() and true_part.any():
-            of_visible = _both_ways(
+            of_visible = _two_way_figures(
                 accuracy[part], completeness[true_part], cosine[part], true_cosine[true_part], options.threshold
             )
             out |= {f"seen_{name}": value for name, value in of_visible.items()}
@@ -139,7 +139,7 @@ def _visible_in_unit(
     return visible(points * extent, normals, caster, cameras, VISIBLE_TOLERANCE * extent)
 
 
-def _both_ways(
+def _two_way_figures(
     accuracy: np.ndarray, completeness: np.ndarray, cosine: np.ndarray, true_cosine: np.ndarray, threshold: float
 ) -> dict[str, float]:
     """Return the figures of distances and normals' cosines, from result to truth and from truth to result."""

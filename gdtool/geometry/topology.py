@@ -217,9 +217,9 @@ def euler_number(faces: np.ndarray) -> int:
 
 
 def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
-    """Return how many handles a manifold of `pieces` pieces has, by Euler's formula; it may have boundary loops.
+    """Return how many handles a manifold of `pieces` connected pieces has; it may have boundary loops.
 
-    edges: the edges of the faces, where they are known.
+    By Euler's formula. edges: the edges of the faces, where they are known.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -165,11 +165,11 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find texels that a chart's outline passes through and that are not next to any owned texel.
+    """Find the texels that a chart's outline passes through where no texel nearby has an owner.
 
-    Charts smaller than a texel, and the ends of slivers, cover no texel's centre; lookups there would read the
-    continuation of neighbouring charts. Texels next to owned ones are left to extend_owners(). owner (size, size) as
-    from owners_of(). Returns texel (n,), row-major indices, and the triangle (n,) there.
+    Charts smaller than a texel, and the ends of slivers, cover no texel's centre. Lookups there would read what lies
+    around neighbouring charts. Texels next to owned ones are left out, since extend_owners() fills them. owner (size,
+    size) as from owners_of(). Returns texel (n,), row-major indices, and the triangle (n,) there.
     """
     from gdtool.geometry.topology import edges_of
 

@@ -71,7 +71,7 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
     return np.stack(parts)
 
 
-def without_traces(mask: np.ndarray) -> np.ndarray:
+def zero_faint_coverage(mask: np.ndarray) -> np.ndarray:
     """Set coverage (k, h, w) below half a step of 8-bit storage to 0."""
     return np.where(mask > MIN_COVERAGE, mask, 0).astype(np.float32)
 
