@@ -25,7 +25,7 @@ def guarded(group: click.Command) -> None:
 
 
 def _code_of(group: click.Command) -> int:
-    """Run a command, and return the exit code of whatever it returns or raises."""
+    """Run a command; returns its exit code, or the one that stands for the exception that it raised."""
     try:
         # Not group.main(): click would turn a broken pipe into exit code 1.
         with group.make_context("gdtool", sys.argv[1:]) as context:

@@ -18,10 +18,10 @@ CURE = "name another output with -o"
 
 
 def output_place(path: Path) -> Path:
-    """Return where an output really lies: path, or the place that a link at path points to.
+    """Return the path of an output with a link at `path` followed.
 
-    A link is followed once, and stays. Raises UsageError for a link to a link, for a name with a line break, another
-    control character or NUL, and for anything at the place that is not a folder.
+    A link is followed once, and is not replaced. Raises UsageError for a link to a link, for a name with a line break,
+    another control character or NUL, and where something else than a folder lies at the result.
     """
     fault = text_fault(str(path), byte_escapes=True)
     if fault:

@@ -48,7 +48,7 @@ class Origin:
 def origins(folder: Folder) -> Iterator[Origin]:
     """Yield the inputs that a folder's manifest lists, without generated objects.
 
-    Paths in manifests are relative to where the folder really lies.
+    Paths in manifests are relative to the folder with its links resolved.
     """
     for entry in folder.manifest.inputs:
         if not entry.path.startswith("procedural:"):

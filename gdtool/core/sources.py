@@ -197,7 +197,9 @@ def digest(source: Source) -> str:
 
 
 def relative_to(path: Path | str, folder: Path) -> str:
-    """Return path relative to where folder really lies, with forward slashes; procedural:SEED stays as it is."""
+    """Return path relative to folder, links in folder resolved, with forward slashes; procedural:SEED is returned
+    unchanged.
+    """
     if isinstance(path, str):
         return path
     # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead

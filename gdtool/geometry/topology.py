@@ -219,7 +219,7 @@ def euler_number(faces: np.ndarray) -> int:
 def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
     """Return how many handles a manifold of `pieces` connected pieces has; it may have boundary loops.
 
-    By Euler's formula. edges: the edges of the faces, where they are known.
+    The number follows from Euler's formula. edges: the edges of the faces, where they are known.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -142,14 +142,16 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def follow(threads: int) -> None:
-    """Train as a process of torchrun that is not the first: wait for the first one's order, follow it, and end."""
+    """Train in a process of torchrun other than the first: wait until the first process sends its options, and train
+    with it.
+    """
     from gdtool.diffusion.training import worker
 
     worker.follow(threads)
 
 
 def dismiss() -> None:
-    """Let the other processes end, as the first one's last step."""
+    """Tell the other processes of torchrun to end; the first process calls this last."""
     from gdtool.diffusion.training import distributed
 
     distributed.leave()
@@ -164,7 +166,7 @@ def plan(options: Options, as_json: bool) -> str:
 
 
 def configured(options: Options):
-    """Apply the ablation, --config and the flags to the preset. Raises InputError."""
+    """Return the configurations: the preset, changed by the ablation, --config and the flags. Raises InputError."""
     from gdtool.diffusion.configure import configuration
 
     # Without --steps the minutes decide when the training ends.

@@ -111,7 +111,7 @@ def _unwrap(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
-    """Tell whether the mesh's own texture coordinates are kept; record it, or warn why they are not."""
+    """Tell whether the input's texture coordinates are kept; record that they are, or warn why they are not."""
     from gdtool.unwrap.pipeline import invalid_reason
 
     if mesh.uv is None or options.redo:
@@ -180,7 +180,7 @@ def _with_wide_indices(mesh):
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
-    """Find twins and corners as mirror_twins() does; without --symmetry no face has a twin."""
+    """Return the mirror twin (f,) of each face and its corners (f, 4); -1 for none, and without --symmetry."""
     import numpy as np
 
     from gdtool.geometry.meshes import QuadMesh
