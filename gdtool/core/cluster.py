@@ -74,10 +74,10 @@ def _require_listener(address: str) -> None:
 
 
 def _task_slots(ray: Any, cores: int) -> int:
-    """Return how many tasks may be submitted at a time: one for each `cores` cores of the cluster, and AHEAD more that
-    wait.
+    """Return how many tasks may be submitted at a time.
 
-    A cluster may grow, so the cores are counted at each call.
+    These are one for each `cores` cores of the cluster, and two more (AHEAD) that wait. A cluster may grow, so the
+    cores are counted at each call.
     """
     return max(int(ray.cluster_resources().get("CPU", 1)) // cores, 1) + AHEAD
 

@@ -51,7 +51,7 @@ class Stopped(KeyboardInterrupt):
 
 
 def listen() -> Callable[[], None]:
-    """Make the signals of SIGNALS raise Stopped in the main thread, once.
+    """Make the signals that ask a process to end (SIGNALS) raise Stopped in the main thread, once.
 
     Signals that the caller ignores stay ignored. Returns a function that restores the previous handlers. Where listen()
     is active already, neither it nor the returned function does anything.

@@ -53,10 +53,11 @@ def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "")
 
 
 def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """Return the path of the texture that a name in an .mtl stands for, as obj_file() does.
+    """Return the path of the texture that a name in an .mtl stands for.
 
-    It is looked for in TEXTURE_PLACES; the path in the first is returned where none has it. Raises InputError also for
-    a FIFO, a device or a socket.
+    model, name, subject, what, folder: as for obj_file(). The file is looked for in several folders (TEXTURE_PLACES);
+    where none has it, the path in the first is returned. Raises InputError as obj_file() does, and for a FIFO, a device
+    or a socket.
     """
     first = obj_file(model, name, subject, what, folder)
     if first is None:

@@ -16,7 +16,7 @@ CURE = "name what to measure against with --reference"
 
 
 def kind_of(source: Source | None) -> str:
-    """Return a folder's kind, MODEL for a model file or a generated object, and "" for None."""
+    """Return the kind of a folder, "model" for a model file or a generated object, and "" for None."""
     if isinstance(source, Folder):
         return source.kind
     return "" if source is None else MODEL

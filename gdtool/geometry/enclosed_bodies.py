@@ -26,8 +26,8 @@ class EnclosedBodies(NamedTuple):
 def enclosed_bodies(mesh: TriMesh, welded: bool = True) -> EnclosedBodies:
     """Count closed bodies inside other closed bodies.
 
-    A body is a set of faces connected by edges. Open bodies neither enclose nor count. A closed body counts where the
-    winding number of one other body is about 1 or -1 at all of up to _SAMPLES of its vertices. welded: False where
+    A body is a set of faces connected by edges. Open bodies neither enclose nor count. A closed body counts where a few
+    of its vertices (_SAMPLES) all have a winding number of about 1 or -1 in one other body. welded: False where
     vertices at one position have several indices, as along seams of texture coordinates.
     """
     vertices, faces = mesh.vertices, mesh.faces

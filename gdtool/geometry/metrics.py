@@ -134,7 +134,10 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
 def _visible_in_unit(
     points: np.ndarray, normals: np.ndarray, mesh: TriMesh, cameras: Sequence[Camera], extent: float
 ) -> np.ndarray:
-    """Do what visible() does, for points and a mesh in units of `extent`; the cameras are in the caller's units."""
+    """Return (n,) bool: whether points (n, 3) of a mesh are visible in any camera's picture.
+
+    points, mesh: in units of `extent`, which is in the cameras' unit. normals (n, 3): of the points, unit.
+    """
     caster = RayCaster(TriMesh(mesh.vertices * extent, mesh.faces))
     return visible(points * extent, normals, caster, cameras, VISIBLE_TOLERANCE * extent)
 
@@ -179,7 +182,10 @@ def volume_iou(mesh: TriMesh, truth: TriMesh, cells: int = IOU_CELLS, pad: float
 
 
 def _grid_iou(mesh: TriMesh, truth: TriMesh, center: np.ndarray, side: float, cells: int) -> float:
-    """Do what volume_iou() does, in the cube with this centre (3,) and side."""
+    """Compute the intersection over union of two volumes at the centres of cells^3 cells of a cube.
+
+    center (3,) and side of the cube, in the unit of the meshes.
+    """
     a, b = (occupancy(body, center, side, cells) for body in (mesh, truth))
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else 0.0

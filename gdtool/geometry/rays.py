@@ -52,9 +52,10 @@ def intersect_planes(origins: np.ndarray, directions: np.ndarray, corners: np.nd
 
 
 def _intersect(origins: np.ndarray, directions: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Do what intersect_planes() does, for triangles packed as (9, n): a corner and two edge vectors of each.
+    """Return distance (n,) and barycentric weights (n, 3) where rays meet the planes of triangles, as
+    intersect_planes().
 
-    The layout keeps each component contiguous.
+    packed (9, n): a corner and two edge vectors of each triangle, each component contiguous.
     """
     o, d, a, e1, e2 = origins.T, directions.T, packed[:3], packed[3:6], packed[6:]
     p = cross(d, e2)

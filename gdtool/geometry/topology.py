@@ -290,7 +290,11 @@ def _may_have_twins(faces: np.ndarray) -> bool:
 
 
 def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
-    """Do np.argsort(keys, kind="stable") for keys (n,) below width in linear time, as rows of a sparse matrix."""
+    """Return the stable sorting order (n,) of keys (n,) that are integers below width, in linear time.
+
+    The result is that of np.argsort(keys, kind="stable"). Many keys are sorted as the row indices of a sparse matrix,
+    few by numpy.
+    """
     from scipy.sparse import csr_array
 
     if len(keys) < _MIN_COUNTING_KEYS or width > 2**31 - 1 or len(keys) > 2**31 - 1:
@@ -300,7 +304,10 @@ def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
 
 
 def _components_of_twins(twins: np.ndarray) -> tuple[int, np.ndarray]:
-    """Do what components() does, for triangles that have twins (3 f,)."""
+    """Return the number of pieces and the piece (f,) of each triangle of a mesh with an opposite to each half edge.
+
+    twins (3 f,): these opposites, as from twins_of().
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 

@@ -22,8 +22,9 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
     """Raise InputError for an empty, truncated or animated file.
 
-    Raises ResourceError for a huge PNG, or a file beyond MAX_FILE_BYTES. head: the first 64 bytes. file: open for
-    reading. Decoders print to stderr or fill with grey where a file ends early, so this looks first.
+    Raises ResourceError for a PNG of too many pixels, or a file of too many bytes (MAX_FILE_BYTES). head: the first 64
+    bytes. file: open for reading. Decoders print to stderr or fill with grey where a file ends early, so the structure
+    is checked first.
     """
     if not head:
         raise InputError(path, "is empty", COPY)
