@@ -323,7 +323,7 @@ def align(points: np.ndarray, others: np.ndarray, steps: int = 60, count: int = 
 def similarity(points: np.ndarray, others: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the (4, 4) rotation, uniform scale and translation that best map points (n, 3) to others (n, 3).
 
-    Weighted least squares after Umeyama 1991; weights (n,).
+    It minimises the squared distances, weighted by weights (n,), after Umeyama 1991.
     """
     weights = weights / weights.sum()
     center, other_center = weights @ points, weights @ others

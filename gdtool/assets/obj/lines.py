@@ -245,7 +245,10 @@ def _parsed(text: np.ndarray, kind: type, count: int) -> np.ndarray:
 
 
 def _numbers(payload: _Payload, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parse the first `width` numbers of each line (lines, width), and the fourth to sixth (lines, 3), or (0, 3)."""
+    """Parse the first `width` numbers of each line as (lines, width), float64.
+
+    Also returns the fourth to sixth numbers (lines, 3), the colors of vertices, where every line has six; else (0, 3).
+    """
     if not len(payload.begins):
         return np.empty((0, width)), np.empty((0, 3))
     table = _word_table(_words(payload.text), payload.begins)
