@@ -74,7 +74,7 @@ def main(load: Callable[[], click.Command] = _cli) -> None:
 def _open_streams() -> None:
     """Open /dev/null in place of standard streams that the caller closed.
 
-    Else a file of the user's would get the number of one of them.
+    Otherwise the next file that is opened gets the number of a standard stream, and output could be written into it.
     """
     for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
         try:

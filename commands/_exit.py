@@ -25,7 +25,7 @@ def guarded(group: click.Command) -> None:
 
 
 def _code_of(group: click.Command) -> int:
-    """Run a command, and return the exit code of whatever it returns or raises."""
+    """Run a command; returns its exit code, or the one that stands for the exception that it raised."""
     try:
         # Not group.main(): click would turn a broken pipe into exit code 1.
         with group.make_context("gdtool", sys.argv[1:]) as context:
@@ -43,7 +43,7 @@ def _code_of(group: click.Command) -> int:
     except BrokenPipeError:
         code = BROKEN_PIPE
     except Exception as error:
-        code = tell(error, "gdtool").exit_code if ending.received is None else 0
+        code = report_exception(error, "gdtool").exit_code if ending.received is None else 0
     if ending.received:  # a library may have turned the signal's exception into another one
         code = 128 + ending.received
         if ending.received == getattr(signal, "SIGXCPU", None):
@@ -59,9 +59,9 @@ def _report_usage(error: click.ClickException) -> int:
         error.show()
         return error.exit_code
     context = getattr(error, "ctx", None)
-    place = context.command_path if context is not None else "gdtool"
+    command_path = context.command_path if context is not None else "gdtool"
     text = " ".join(error.format_message().split()).rstrip(".")
-    log.line(f"{place}: {text[:1].lower() + text[1:]}; see {place} --help")
+    log.line(f"{command_path}: {text[:1].lower() + text[1:]}; see {command_path} --help")
     return error.exit_code
 
 
@@ -74,7 +74,7 @@ def _close_stdout() -> None:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def tell(error: Exception, subject: object) -> GdtoolError:
+def report_exception(error: Exception, subject: object) -> GdtoolError:
     """Report an exception that was raised while working on subject, with its traceback under --debug.
 
     Returns the error with an exit code that the exception stands for.

@@ -54,7 +54,7 @@ def _loaded(plugin) -> click.Command:
     cure = f"pip uninstall {package}, or install a release of it that works with this gdtool"
     try:
         command = plugin.load()
-    except (Exception, SystemExit) as error:  # of a stranger's module
+    except (Exception, SystemExit) as error:  # a plugin's module may raise anything
         raise ResourceError(
             f"plugin {plugin.name}", f"cannot be loaded ({type(error).__name__}: {first_line(error)})", cure
         ) from error

@@ -1,4 +1,6 @@
-"""Options of the command line: their types, those derived from a stage's Options, and those of every command."""
+"""Define the options of the command line: their types, those derived from a stage's Options, and those of every
+command.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ import msgspec
 
 from gdtool.core import log
 from gdtool.core.errors import UsageError
-from gdtool.core.names import shown, text_fault
+from gdtool.core.names import quoted, text_fault
 
 LOG_FILE_HELP = "Append all messages, with times, to a file."
 VERBOSITY = {
@@ -51,7 +53,7 @@ class Text(click.ParamType):
         """Return the string; fail for one with a control character."""
         fault = text_fault(value, byte_escapes=True)
         if fault:
-            self.fail(f"{shown(value)} {fault}", param, ctx)
+            self.fail(f"{quoted(value)} {fault}", param, ctx)
         return value
 
 
@@ -70,7 +72,7 @@ def set_verbosity(quiet: bool, verbose: bool, log_file: str | None) -> None:
     """Apply -q, -v and --log-file. Raises OutputError where the file cannot be written."""
     log.level = log.QUIET if quiet else log.VERBOSE if verbose else log.NORMAL
     if log_file:
-        log.keep_in(Path(log_file))
+        log.append_to(Path(log_file))
 
 
 def option_from_field(field: Any, hint: Any) -> click.Option:

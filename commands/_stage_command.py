@@ -13,7 +13,7 @@ import click
 from gdtool.core.errors import GdtoolError
 from gdtool.core.stage import Stage
 
-from ._exit import emit, exit_code, tell
+from ._exit import emit, exit_code, report_exception
 from ._options import (
     LOG_FILE_HELP,
     TEXT,
@@ -87,7 +87,7 @@ def _run(stage: Stage, values: dict[str, Any]) -> int:
             done += 1
             emit((_json_of(result) if values["as_json"] else os.fsencode(result.path)) + b"\n")
         else:
-            failed.append(tell(result, "gdtool"))
+            failed.append(report_exception(result, "gdtool"))
     return exit_code(failed, done)
 
 

@@ -1,4 +1,4 @@
-"""`gdtool bake`: options and help come from the stage."""
+"""Define `gdtool bake`; its options and help come from the stage."""
 
 from gdtool.stages import bake as stage
 

@@ -1,4 +1,4 @@
-"""`gdtool evaluate`: measure results against a reference; reports go to stdout."""
+"""Define `gdtool evaluate`: measure results against a reference, and write the reports to stdout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gdtool.core.errors import GdtoolError
 from gdtool.core.folder import Folder
 from gdtool.stages import evaluate as stage
 
-from ._exit import emit, exit_code, tell
+from ._exit import emit, exit_code, report_exception
 from ._options import TEXT, build_options, options_from, set_verbosity, verbosity_options
 from ._stage_command import help_of
 
@@ -94,7 +94,7 @@ def command(results: tuple[str, ...], reference: str | None, views: str | None, 
         except Exception as error:
             if ending.received is not None:
                 raise
-            failed.append(tell(error, text))
+            failed.append(report_exception(error, text))
             continue
         done += 1
         line = json.dumps({"path": text, **report}, allow_nan=False) if as_json else table(report)

@@ -1,4 +1,4 @@
-"""`gdtool import-views`: options and help come from the stage."""
+"""Define `gdtool import-views`; its options and help come from the stage."""
 
 from gdtool.stages import import_views as stage
 

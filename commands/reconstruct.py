@@ -1,4 +1,4 @@
-"""`gdtool reconstruct`: options and help come from the stage."""
+"""Define `gdtool reconstruct`; its options and help come from the stage."""
 
 from gdtool.stages import reconstruct as stage
 

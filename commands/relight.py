@@ -1,4 +1,4 @@
-"""`gdtool relight`: options and help come from the stage."""
+"""Define `gdtool relight`; its options and help come from the stage."""
 
 from gdtool.stages import relight as stage
 

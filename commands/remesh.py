@@ -1,4 +1,4 @@
-"""`gdtool remesh`: options and help come from the stage."""
+"""Define `gdtool remesh`; its options and help come from the stage."""
 
 from gdtool.stages import remesh as stage
 

@@ -1,4 +1,4 @@
-"""`gdtool render-dataset`: options and help come from the stage."""
+"""Define `gdtool render-dataset`; its options and help come from the stage."""
 
 from gdtool.stages import render_dataset as stage
 

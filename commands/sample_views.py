@@ -1,4 +1,4 @@
-"""`gdtool sample-views`: options and help come from the stage."""
+"""Define `gdtool sample-views`; its options and help come from the stage."""
 
 from gdtool.stages import sample_views as stage
 

@@ -1,4 +1,7 @@
-"""`gdtool train`: options and help come from the stage; adds --plan, and follows the first process of torchrun."""
+"""Define `gdtool train`; its options and help come from the stage.
+
+It adds --plan. Started by torchrun, the first process runs the command and the others follow it.
+"""
 
 import os
 
@@ -14,7 +17,7 @@ command.params.append(
     click.Option(
         ["--plan"],
         is_flag=True,
-        help="Tell memory, FLOPs and time of the training, computed from its structure; no data.",
+        help="Print the memory, FLOPs and time that the training needs, computed from its structure; reads no data.",
     )
 )
 assert command.callback is not None

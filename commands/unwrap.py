@@ -1,4 +1,4 @@
-"""`gdtool unwrap`: options and help come from the stage."""
+"""Define `gdtool unwrap`; its options and help come from the stage."""
 
 from gdtool.stages import unwrap as stage
 

@@ -1,4 +1,4 @@
-"""`gdtool validate`: check folders and .glb files against the format."""
+"""Define `gdtool validate`: check folders and .glb files against the format."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gdtool.core import ending, sources
 from gdtool.core.errors import InputError
 from gdtool.stages import validate as stage
 
-from ._exit import emit, report_text, tell
+from ._exit import emit, report_exception, report_text
 from ._options import TEXT, set_verbosity, verbosity_options
 from ._stage_command import help_of
 
@@ -32,7 +32,7 @@ def command(paths, as_json, log_file, quiet, verbose, debug):
         except Exception as error:  # the path could not be checked, which says nothing of its validity
             if ending.received is not None:
                 raise
-            code = tell(error, text).exit_code
+            code = report_exception(error, text).exit_code
             continue
         if faults and not code:
             code = InputError.exit_code

@@ -1,1 +1,1 @@
-"""Shared by the benchmarks: timing of commands, resumable rows, test meshes, wireframes."""
+"""Time commands, keep resumable rows, make test meshes and draw wireframes, for all benchmarks."""

@@ -1,9 +1,10 @@
-"""Blender's QuadriFlow or Smart UV project on one mesh, as its users call them. Runs in a Python that has bpy:
+"""Run Blender's QuadriFlow or Smart UV Project on one mesh, with the settings that its users choose.
 
-    python blender_meshing.py quadriflow|smart IN.npz OUT.npz [QUADS_OR_MARGIN]
+  python blender_meshing.py quadriflow|smart IN.npz OUT.npz [QUADS_OR_MARGIN]
 
 IN: vertices (v, 3), faces (f, 4), -1 as a triangle's fourth corner. OUT: vertices and faces, or uv (c, 2) with v up and
-face_uvs (f, 4); seconds of the operator alone. No gdtool here: bpy brings its own Python.
+face_uvs (f, 4); and the seconds of the operator alone. Runs in a Python that has bpy; it does not import gdtool,
+because bpy brings its own Python.
 """
 
 import sys
@@ -13,8 +14,8 @@ import bpy
 import numpy as np
 
 
-def made(vertices: np.ndarray, faces: np.ndarray):
-    """A mesh object, the active one."""
+def active_object(vertices: np.ndarray, faces: np.ndarray):
+    """Make a mesh object of vertices (v, 3) and faces (f, 4), and make it the active one."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     mesh = bpy.data.meshes.new("mesh")
     used = faces >= 0
@@ -26,65 +27,68 @@ def made(vertices: np.ndarray, faces: np.ndarray):
     mesh.polygons.add(len(faces))
     mesh.polygons.foreach_set("loop_start", (np.cumsum(total) - total).astype(np.int32))
     mesh.update(calc_edges=True)
-    thing = bpy.data.objects.new("mesh", mesh)
-    bpy.context.collection.objects.link(thing)
-    bpy.context.view_layer.objects.active = thing
-    thing.select_set(True)
-    return thing
+    mesh_object = bpy.data.objects.new("mesh", mesh)
+    bpy.context.collection.objects.link(mesh_object)
+    bpy.context.view_layer.objects.active = mesh_object
+    mesh_object.select_set(True)
+    return mesh_object
 
 
 def corners(mesh) -> np.ndarray:
-    """(f, 4) loops of each polygon, -1 as a triangle's fourth."""
+    """Return the loop indices (f, 4) of each polygon, -1 as a triangle's fourth."""
     start, total = (np.zeros(len(mesh.polygons), np.int32) for _ in range(2))
     mesh.polygons.foreach_get("loop_start", start)
     mesh.polygons.foreach_get("loop_total", total)
     return np.where(np.arange(4) < total[:, None], start[:, None] + np.arange(4), -1)
 
 
-def prepared(thing, vertices: np.ndarray) -> float:
-    """Enlarges the mesh and drops its tiniest edges; the factor. QuadriFlow calls a mesh with edges below 1e-4 not
-    manifold."""
+def prepare_for_quadriflow(mesh_object, vertices: np.ndarray) -> float:
+    """Enlarge the mesh and dissolve its tiniest edges; returns the factor of the enlargement.
+
+    QuadriFlow reports a mesh with edges below 1e-4 as not manifold.
+    """
     import bmesh
 
     factor = 1000.0 / float(np.linalg.norm(np.ptp(vertices, 0)))
-    thing.data.vertices.foreach_set("co", (vertices * factor).astype(np.float32).ravel())
+    mesh_object.data.vertices.foreach_set("co", (vertices * factor).astype(np.float32).ravel())
     mesh = bmesh.new()
-    mesh.from_mesh(thing.data)
+    mesh.from_mesh(mesh_object.data)
     bmesh.ops.dissolve_degenerate(mesh, dist=5e-4, edges=mesh.edges)
     bmesh.ops.triangulate(mesh, faces=mesh.faces)
-    mesh.to_mesh(thing.data)
+    mesh.to_mesh(mesh_object.data)
     mesh.free()
-    thing.data.update()
+    mesh_object.data.update()
     return factor
 
 
 def main() -> None:
-    way, source, target, asked = sys.argv[1:5]
-    with np.load(source) as given:
-        thing = made(given["vertices"], given["faces"])
-        factor = prepared(thing, given["vertices"]) if way == "quadriflow" else 1.0
+    """Run the operator that the command line names, and write its result."""
+    method, source, target, quads_or_margin = sys.argv[1:5]
+    with np.load(source) as arrays:
+        mesh_object = active_object(arrays["vertices"], arrays["faces"])
+        factor = prepare_for_quadriflow(mesh_object, arrays["vertices"]) if method == "quadriflow" else 1.0
     start = time.perf_counter()
-    if way == "quadriflow":
+    if method == "quadriflow":
         state = bpy.ops.object.quadriflow_remesh(
-            mode="FACES", target_faces=int(asked), use_preserve_sharp=True, use_mesh_symmetry=False, seed=0
+            mode="FACES", target_faces=int(quads_or_margin), use_preserve_sharp=True, use_mesh_symmetry=False, seed=0
         )
         if "FINISHED" not in state:
             sys.exit("QuadriFlow was cancelled")
         seconds = time.perf_counter() - start
-        mesh = thing.data
+        mesh = mesh_object.data
         points, vertex = np.zeros(3 * len(mesh.vertices), np.float32), np.zeros(len(mesh.loops), np.int32)
         mesh.vertices.foreach_get("co", points)
         mesh.loops.foreach_get("vertex_index", vertex)
         loops = corners(mesh)
-        found = np.where(loops < 0, -1, vertex[loops]).astype(np.int64)
-        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64) / factor, faces=found, seconds=seconds)
+        faces = np.where(loops < 0, -1, vertex[loops]).astype(np.int64)
+        np.savez(target, vertices=points.reshape(-1, 3).astype(np.float64) / factor, faces=faces, seconds=seconds)
         return
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.mesh.select_all(action="SELECT")
-    bpy.ops.uv.smart_project(angle_limit=np.radians(66), margin_method="FRACTION", island_margin=float(asked))
+    bpy.ops.uv.smart_project(angle_limit=np.radians(66), margin_method="FRACTION", island_margin=float(quads_or_margin))
     bpy.ops.object.mode_set(mode="OBJECT")
     seconds = time.perf_counter() - start
-    mesh = thing.data
+    mesh = mesh_object.data
     uv, vertex = np.zeros(2 * len(mesh.loops), np.float32), np.zeros(len(mesh.loops), np.int32)
     mesh.uv_layers.active.data.foreach_get("uv", uv)
     mesh.loops.foreach_get("vertex_index", vertex)

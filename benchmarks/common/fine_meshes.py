@@ -1,7 +1,6 @@
-"""Meshes that remesh and unwrap are measured on: solids with creases in closed form, and public models, by marching
-cubes.
+"""Make the meshes that remesh and unwrap are measured on: analytic solids and public models, by marching cubes.
 
-Each comes as vertices (v, 3) in a unit box, triangles (f, 3), about as many as asked, and its true creases as segments
+Each has vertices (v, 3) in a unit box, about the requested number of triangles (f, 3), and its true creases as segments
 (s, 2, 3), None where they are not known. They are kept in a folder, because making one takes up to half a minute.
 """
 
@@ -23,7 +22,7 @@ _TRIANGLES_PER_CELL = 2.5  # marching cubes makes about so many per squared step
 
 @dataclass(frozen=True)
 class Fine:
-    """One input; name tells where it is from."""
+    """Hold one input mesh, its true creases (s, 2, 3) or None, and the name of the solid or model that it shows."""
 
     name: str
     vertices: np.ndarray
@@ -32,7 +31,7 @@ class Fine:
 
 
 def part(x, y, z):
-    """A sharp part: a box with a bore along z and a ball on top."""
+    """Evaluate the signed distance of a sharp machine part: a box with a bore along z and a ball on top."""
     (a, b, c), ball = _PART["half"], _PART["ball"]
     beyond = np.stack([abs(x) - a, abs(y) - b, abs(z) - c])
     box = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
@@ -41,7 +40,10 @@ def part(x, y, z):
 
 
 def bracket(x, y, z):
-    """Two plates at a right angle with a hole in one and a rib between: thin parts, long creases."""
+    """Evaluate the signed distance of a bracket with thin parts and long creases.
+
+    It has two plates at a right angle, a hole in one, and a rib between them.
+    """
 
     def box(cx, cy, cz, a, b, c):
         return np.maximum(np.maximum(abs(x - cx) - a, abs(y - cy) - b), abs(z - cz) - c)
@@ -52,39 +54,46 @@ def bracket(x, y, z):
 
 
 def knobs(x, y, z):
-    """A ball with smooth bumps: organic, no crease."""
+    """Evaluate the signed distance of a ball with smooth bumps, an organic shape without creases."""
     return 0.9 * (np.sqrt(x * x + y * y + z * z) - 0.72 - 0.08 * np.sin(7 * x) * np.sin(6 * y + 1) * np.sin(8 * z + 2))
 
 
 def rings(x, y, z):
-    """Two linked tori of two thicknesses: genus two, two pieces."""
-    one = np.hypot(np.hypot(x - 0.25, y) - 0.5, z) - 0.16
-    return np.minimum(one, np.hypot(np.hypot(x + 0.3, z) - 0.45, y) - 0.1)
+    """Evaluate the signed distance of two linked tori of different thickness: two pieces with one handle each."""
+    thick = np.hypot(np.hypot(x - 0.25, y) - 0.5, z) - 0.16
+    return np.minimum(thick, np.hypot(np.hypot(x + 0.3, z) - 0.45, y) - 0.1)
 
 
 SOLIDS: dict[str, Callable] = {"part": part, "bracket": bracket, "knobs": knobs, "rings": rings}
 
 
 def part_creases(count: int = 800) -> np.ndarray:
-    """(s, 2, 3) true creases of part; where the ball meets the side x = a the angle is too near 30 degrees to count."""
+    """Compute the true creases (s, 2, 3) of part().
+
+    Where the ball meets the side x = a the angle is about 30 degrees: too small to count as a crease.
+    """
     (a, b, c), ball, radius, bore = _PART["half"], np.array(_PART["ball"]), _PART["radius"], _PART["bore"]
     line, turn = np.linspace(-1, 1, count), np.linspace(0, 2 * np.pi, 2 * count)
-    one, around = np.ones(count), np.ones(2 * count)
+    straight, around = np.ones(count), np.ones(2 * count)
     curves = [np.stack([bore * np.cos(turn), bore * np.sin(turn), side * c * around], -1) for side in (-1, 1)]
     curves.append(np.stack([ball[0] + radius * np.cos(turn), b * around, radius * np.sin(turn)], -1))
     for s in (-1, 1):
         for t in (-1, 1):
             curves += [
-                np.stack([a * line, s * b * one, t * c * one], -1),
-                np.stack([s * a * one, b * line, t * c * one], -1),
-                np.stack([s * a * one, t * b * one, c * line], -1),
+                np.stack([a * line, s * b * straight, t * c * straight], -1),
+                np.stack([s * a * straight, b * line, t * c * straight], -1),
+                np.stack([s * a * straight, t * b * straight, c * line], -1),
             ]
     segments = np.concatenate([np.stack([p[:-1], p[1:]], 1) for p in curves])
     return segments[abs(part(*segments.mean(1).T)) < 1e-3]
 
 
 def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.ndarray, np.ndarray]:
-    """Zero set of field(x, y, z), negative inside, as about so many triangles, counter-clockwise from outside."""
+    """Extract the surface where field(x, y, z) is zero, as vertices (v, 3) and about `triangles` faces (f, 3).
+
+    field: negative inside. half: half the side of the cube that is sampled. Faces are counter-clockwise seen from
+    outside.
+    """
     from skimage.measure import marching_cubes
 
     def at(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -100,8 +109,10 @@ def marched(field: Callable, triangles: int, half: float = 1.06) -> tuple[np.nda
 
 
 def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """A closed surface of about so many triangles around any model: zero set of its distance, signed by winding
-    number."""
+    """Make a closed surface of about `triangles` faces around any model, open ones included.
+
+    It is the zero set of the distance to the model's surface, signed by the winding number.
+    """
     from skimage.measure import marching_cubes
 
     from gdtool.geometry.distance import closest_points, winding_number
@@ -130,10 +141,10 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
     near = np.flatnonzero(abs(coarse) < 0.5 * 3**0.5 * (factor + 2) * step)
     corner = np.stack(np.unravel_index(near, blocks), -1) * factor
     offsets = np.stack(np.meshgrid(*(np.arange(factor + 1),) * 3, indexing="ij"), -1).reshape(-1, 3)
-    wanted = np.zeros(shape, bool)
+    is_near = np.zeros(shape, bool)
     for offset in offsets:
-        wanted[tuple((corner + offset).T)] = True
-    index = np.argwhere(wanted)
+        is_near[tuple((corner + offset).T)] = True
+    index = np.argwhere(is_near)
     # Only samples beside the surface matter: the distance tells which, and only they need a winding number.
     points = low + index * step
     distance = closest_points(points, TriMesh(vertices, faces))[0]
@@ -145,38 +156,48 @@ def solidified(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple
         index[~beside], index[beside], inside[beside], coarse.reshape(blocks), block[~beside]
     )
     values[tuple(index.T)] = np.where(inside, -distance, distance)
-    found, out, _, _ = marching_cubes(values, 0.0)
-    return found * step + low, out.astype(np.int64)
+    surface_points, surface_faces, _, _ = marching_cubes(values, 0.0)
+    return surface_points * step + low, surface_faces.astype(np.int64)
 
 
 def _nearest_sign(
-    asked: np.ndarray, known: np.ndarray, inside: np.ndarray, coarse: np.ndarray, block: np.ndarray
+    index: np.ndarray, near_index: np.ndarray, near_inside: np.ndarray, coarse: np.ndarray, block: np.ndarray
 ) -> np.ndarray:
-    """Whether samples off the surface are inside: as the nearest sample beside it is."""
+    """Tell which samples off the surface are inside (n,) bool: as the nearest sample beside the surface is.
+
+    index (n, 3): of the samples. near_index (m, 3), near_inside (m,): samples beside the surface. coarse: signed
+    distances of the blocks, and block (n, 3): the block of each sample, for a grid without samples beside a surface.
+    """
     from scipy.spatial import cKDTree
 
-    if not len(known):
+    if not len(near_index):
         return coarse[tuple(block.T)] < 0
-    return inside[cKDTree(known).query(asked)[1]]
+    return near_inside[cKDTree(near_index).query(index)[1]]
 
 
 def unit(vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Vertices with their bounding box centred and its longest side 1, and that centre and side."""
+    """Scale vertices (v, 3) so that their bounding box is centred and its longest side 1; also returns that centre and
+    side.
+    """
     low, high = vertices.min(0), vertices.max(0)
     return (vertices - (low + high) / 2) / (high - low).max(), (low + high) / 2, float((high - low).max())
 
 
-def models_in(places: Iterable[Path]) -> list[Path]:
-    """Model files named, and those in folders named, by name; control meshes and parts of others are left out."""
+def models_in(paths: Iterable[Path]) -> list[Path]:
+    """List the model files among paths and in the folders among them, sorted; files with "control" in their name are
+    left out.
+    """
     out = []
-    for place in places:
-        files = [place] if place.is_file() else [p for p in sorted(place.rglob("*")) if p.suffix.lower() in SUFFIXES]
-        out += [p for p in files if "control" not in p.name]
+    for path in paths:
+        files = (
+            [path] if path.is_file() else [file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES]
+        )
+        out += [file for file in files if "control" not in file.name]
     return out
 
 
 def of_solid(name: str, triangles: int, folder: Path) -> Fine:
-    """One of SOLIDS."""
+    """Make the mesh of one of SOLIDS, or read it from the folder of kept meshes."""
 
     def make() -> tuple[np.ndarray, np.ndarray]:
         return marched(SOLIDS[name], triangles)
@@ -187,7 +208,9 @@ def of_solid(name: str, triangles: int, folder: Path) -> Fine:
 
 
 def of_model(path: Path, triangles: int, folder: Path) -> Fine:
-    """A model file, made solid; raises what reading it raises."""
+    """Make a closed mesh of a model file, or read it from the folder of kept meshes; raises what reading the model
+    raises.
+    """
 
     def make() -> tuple[np.ndarray, np.ndarray]:
         from gdtool.assets.load import load_scene
@@ -201,9 +224,10 @@ def of_model(path: Path, triangles: int, folder: Path) -> Fine:
 
 
 def _kept(path: Path, make: Callable) -> tuple[np.ndarray, np.ndarray]:
+    """Read vertices and faces from a .npz file, or make them and write it."""
     if path.exists():
-        with np.load(path) as found:
-            return found["vertices"], _outward(found["vertices"], found["faces"])
+        with np.load(path) as arrays:
+            return arrays["vertices"], _outward(arrays["vertices"], arrays["faces"])
     vertices, faces = make()
     vertices, faces = vertices.astype(np.float64), _outward(vertices, faces).astype(np.int64)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -212,6 +236,6 @@ def _kept(path: Path, make: Callable) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _outward(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Faces of a closed mesh, all turned if they face inward."""
+    """Reverse all faces of a closed mesh where they face inward."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) >= 0 else faces[:, ::-1].copy()

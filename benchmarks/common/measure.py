@@ -1,4 +1,4 @@
-"""Run gdtool commands as a user does, and say what each cost: seconds of wall clock and peak memory."""
+"""Run gdtool commands as a user does, and measure what each costs: seconds of wall clock and peak memory."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ ROOT = Path(__file__).resolve().parents[2]  # of the checkout
 
 
 class Failed(Exception):
-    """A command that did not succeed; its last line of stderr and exit code."""
+    """Report that a command failed; str() has its exit code and its last line of stderr."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What one command took. peak_mb: largest resident set of the process or of one of its children; cpu_seconds: of
-    the process and its children, user and system, over all threads."""
+    """Hold what one command took, and its stdout.
+
+    seconds: wall clock. peak_mb: largest resident set of the process or of one of its children. cpu_seconds: of the
+    process and its children, user and system, over all threads.
+    """
 
     seconds: float
     peak_mb: float
@@ -32,16 +35,16 @@ class Cost:
 
 
 def command() -> str:
-    """The gdtool of this environment, else of the PATH."""
+    """Return the path of the gdtool of this environment, else of the one on PATH."""
     beside = Path(sys.executable).with_name("gdtool")
-    found = str(beside) if beside.exists() else shutil.which("gdtool")
-    if found is None:
+    path = str(beside) if beside.exists() else shutil.which("gdtool")
+    if path is None:
         sys.exit("gdtool is not installed; run make venv")
-    return found
+    return path
 
 
 def peak_mb(process: int | str = "self") -> float:
-    """The largest that a process has been, 0 when it has ended."""
+    """Return the largest resident set that a process has had so far, in MB; 0 where it has ended."""
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
     except OSError:
@@ -50,7 +53,7 @@ def peak_mb(process: int | str = "self") -> float:
 
 
 def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
-    """Run `gdtool arguments`. Raises Failed."""
+    """Run `gdtool arguments` and return its cost. Raises Failed."""
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         start, high = time.perf_counter(), 0.0
         process = subprocess.Popen([command(), *map(str, arguments)], stdout=out, stderr=err)
@@ -79,12 +82,12 @@ def gdtool(*arguments: str | Path, limit_seconds: float = 1800) -> Cost:
 
 
 def evaluate(result: Path, *arguments: str | Path) -> dict:
-    """The report of `gdtool evaluate result arguments`. Raises Failed."""
+    """Run `gdtool evaluate result arguments` and return its report. Raises Failed."""
     return json.loads(gdtool("evaluate", result, "--json", "--quiet", *arguments).stdout)
 
 
 def machine() -> str:
-    """Processor and cores, for the head of a report."""
+    """Name the processor and the number of cores, for the head of a report."""
     model = next(
         (
             line.split(":", 1)[1].strip()
@@ -97,7 +100,7 @@ def machine() -> str:
 
 
 def busy() -> str:
-    """A sentence for the report when the machine had other work as the benchmark began, else nothing."""
+    """Return a sentence for the report where the machine had other work as the benchmark began, else ""."""
     working, cores = _cores_at_work(), len(os.sched_getaffinity(0))
     return (
         f"Other work ran meanwhile ({working:.1f} of {cores} cores as it began): the times are upper bounds."
@@ -107,8 +110,11 @@ def busy() -> str:
 
 
 def _cores_at_work(seconds: float = 1.0) -> float:
-    """How many cores work right now; the load of the last minute, which counts what ended since, where the kernel does
-    not say."""
+    """Measure how many cores work right now, over `seconds`.
+
+    Where the kernel has no /proc/stat, returns the load average of the last minute, which also counts processes that
+    ended since.
+    """
     if not Path("/proc/stat").exists():
         return os.getloadavg()[0]
 
@@ -122,19 +128,19 @@ def _cores_at_work(seconds: float = 1.0) -> float:
 
 
 def say(text: str) -> None:
-    """Progress, on stderr."""
+    """Print progress to stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table; the first column is left, the others right aligned."""
+    """Format a Markdown table; the first column is left aligned, the others right."""
     head = list(head)
     lines = ["| " + " | ".join(head) + " |", "|---" + "|--:" * (len(head) - 1) + "|"]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
 def number(value: object, digits: int = 3) -> str:
-    """A figure for a table; a missing one is a dash."""
+    """Format a figure for a table; None becomes a dash."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -143,7 +149,7 @@ def number(value: object, digits: int = 3) -> str:
 
 
 def seconds_axis(axis) -> None:
-    """Make a matplotlib axis' x logarithmic in seconds, labelled 1, 2, 5, 10, …"""
+    """Make the x axis of a matplotlib plot logarithmic in seconds, labelled 1, 2, 5, 10, …"""
     from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
     axis.set(xscale="log", xlabel="seconds")

@@ -1,4 +1,4 @@
-"""Rows of a benchmark kept as they are measured: a run that was killed goes on, one that is complete starts afresh."""
+"""Keep the rows of a benchmark in a file as they are measured, so that a run that was killed can go on."""
 
 from __future__ import annotations
 
@@ -9,25 +9,34 @@ from benchmarks.common.measure import machine
 
 
 class Rows:
-    """Rows told apart by model and way, written to a JSON file one by one; only rows of the same settings go on."""
+    """Keep rows, one for each model and method ("way"), in a JSON file that is written after each.
+
+    A new run goes on from the file where its settings are the same and it is not complete; else it starts afresh.
+    """
 
     def __init__(self, path: Path, settings: dict):
         self.path, self.settings, self.rows = path, settings, []
         if path.exists():
-            kept = json.loads(path.read_text())
-            if kept.get("settings") == settings and not kept.get("complete"):
-                self.rows = kept["rows"]
+            earlier = json.loads(path.read_text())
+            if earlier.get("settings") == settings and not earlier.get("complete"):
+                self.rows = earlier["rows"]
 
     def has(self, model: str, way: str) -> bool:
+        """Tell whether a model was measured by a method."""
         return any(row["model"] == model and row["way"] == way for row in self.rows)
 
     def add(self, row: dict) -> None:
-        """Behind the others of its model, so that what is measured again stays in its place."""
-        behind = max((i for i, one in enumerate(self.rows, 1) if one["model"] == row["model"]), default=len(self.rows))
+        """Insert a row after the others of its model, so that what is measured again stays in its place; writes the
+        file.
+        """
+        behind = max(
+            (i for i, other in enumerate(self.rows, 1) if other["model"] == row["model"]), default=len(self.rows)
+        )
         self.rows.insert(behind, row)
         self.write(False)
 
     def write(self, complete: bool) -> None:
+        """Write all rows; complete: a later run starts afresh."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(
             {"machine": machine(), "settings": self.settings, "complete": complete, "rows": self.rows}, indent=1

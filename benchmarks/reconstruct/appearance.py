@@ -42,7 +42,7 @@ def looks(surface, truth, size: int = 192) -> dict:
         camera = camera_at(22.5 + 90 * i, 20.0, name=str(i), size=size)
         origins, directions = (x.reshape(-1, 3) for x in rays(camera))
         hits, true_hits = ours.first_hit(origins, directions), true.first_hit(origins, directions)
-        both = hits.found & true_hits.found
+        both = hits.is_hit & true_hits.is_hit
         both[both] = np.abs(hits.distance[both] - true_hits.distance[both]) < 0.01
         if not both.any():
             continue
@@ -92,10 +92,10 @@ def picture(vertices: np.ndarray, faces: np.ndarray, size: int = EDGE) -> np.nda
     origins, directions = (x.reshape(-1, 3) for x in rays(camera))
     hits = RayCaster(TriMesh(vertices, faces)).first_hit(origins, directions)
     image = np.ones((len(origins), 3))
-    normal = face_normals(TriMesh(vertices, faces))[0][hits.face_idx[hits.found]]
-    normal *= np.where((normal * directions[hits.found]).sum(1) > 0, -1.0, 1.0)[:, None]
+    normal = face_normals(TriMesh(vertices, faces))[0][hits.face_idx[hits.is_hit]]
+    normal *= np.where((normal * directions[hits.is_hit]).sum(1) > 0, -1.0, 1.0)[:, None]
     light = np.array([0.35, 0.8, 0.5]) / np.linalg.norm([0.35, 0.8, 0.5])
-    image[hits.found] = CLAY * (0.3 + 0.7 * np.clip(normal @ light, 0, 1))[:, None]
+    image[hits.is_hit] = CLAY * (0.3 + 0.7 * np.clip(normal @ light, 0, 1))[:, None]
     return image.reshape(size, 2, size, 2, 3).mean((1, 3))
 
 

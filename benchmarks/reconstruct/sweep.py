@@ -127,7 +127,7 @@ def normals_beside(vertices: np.ndarray, faces: np.ndarray, views) -> float:
         whole = (cover > 0.99).ravel()
         origins, directions = (x.reshape(-1, 3)[whole] for x in rays(camera))
         hits = caster.first_hit(origins, directions)
-        cosine = (normals[hits.face_idx] * shown.reshape(-1, 3)[whole]).sum(1)[hits.found]
+        cosine = (normals[hits.face_idx] * shown.reshape(-1, 3)[whole]).sum(1)[hits.is_hit]
         angles.append(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     return float(np.concatenate(angles).mean())
 

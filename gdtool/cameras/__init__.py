@@ -1,4 +1,4 @@
-"""Cameras: orthographic and perspective projection, the six-view rig, and changes of the world that they stand in."""
+"""Define cameras: orthographic and perspective projection, the six-view rig, and changes of the world around them."""
 
 from gdtool.cameras.camera import Camera, backproject, camera_at, look_at, project, rays, rig
 from gdtool.cameras.transform import fit_depth_range, same_view, transform_camera

@@ -88,7 +88,9 @@ def camera_at(
 ) -> Camera:
     """Place a camera on a sphere around the origin, looking at it.
 
-    azimuth, elevation: degrees. fov_degrees: across; with it the camera is perspective, else orthographic.
+    azimuth, elevation: degrees; azimuth 0 is on +Z, positive toward +X. size: side of its square image in pixels.
+    distance, half_width: world units. fov_degrees: horizontal field of view of a perspective camera; None for an
+    orthographic one.
     """
     a, e = np.radians(azimuth), np.radians(elevation)
     position = distance * np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
@@ -103,7 +105,10 @@ def camera_at(
 
 
 def rig(name: str, size: int) -> list[Camera]:
-    """Make a rig of square cameras: "six", or "wonder3d" with the same azimuths and 1.35 world units across."""
+    """Make the six-view rig: square orthographic cameras of size x size pixels.
+
+    name: "six", or "wonder3d" with the same azimuths and images 1.35 world units across.
+    """
     half_widths = {"six": HALF_WIDTH, "wonder3d": 1.35 / 2}
     if name not in half_widths:
         raise ValueError(f"unknown rig {name!r}; known: {', '.join(half_widths)}")
@@ -113,9 +118,9 @@ def rig(name: str, size: int) -> list[Camera]:
 def rays(camera: Camera, pixels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Compute the rays through pixels: origins and unit directions in the world, float64.
 
-    pixels (..., 2): (x, y) in pixel units; None for all pixel centres, shape (h, w). Orthographic origins lie on the
-    camera plane, so that the distance along an orthographic ray is the depth. The arrays lie in memory component by
-    component.
+    pixels (..., 2): (x, y) in pixel units; None for all pixel centres, shape (h, w). The results have the shape (...,
+    3). Orthographic origins lie on the camera plane, so that the distance along an orthographic ray is the depth. Each
+    component is contiguous in memory.
     """
     if pixels is None:
         x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

@@ -41,9 +41,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def prepare(function: Callable[..., Any], modules: Sequence[str] = (), count: int = 1) -> None:
-    """Start `count` children that import the module of `function`, and `modules`, while this process goes on.
+    """Start `count` child processes ahead of time: they import the module of `function`, and `modules`, and wait.
 
-    A later begin() of `function` uses one of them.
+    This process goes on meanwhile. A later begin() of `function` uses one of them.
     """
     module = _module_of(function)
     waiting = _waiting.setdefault(module, [])
@@ -57,16 +57,16 @@ def begin(
 ) -> Running:
     """Start function(*args, **kwargs) in a child process, which gets a copy of the arguments as they are now.
 
-    function: at the top level of a module. seconds: after so many the child is killed. memory_mb: how much the child's
-    address space may grow beyond its size after importing (Linux). The thread that calls this must outlive the child:
-    the system ends a child with the thread that started it.
+    function: defined at the top level of a module. seconds: the time after which the child is killed. memory_mb: how
+    much the child's address space may grow after its imports (Linux), in MB. The thread that calls this must outlive
+    the child: the system ends a child with the thread that started it.
     """
     module = _module_of(function)
     waiting = _waiting.get(module)
-    place = None
+    working_folder = None
     with contextlib.suppress(OSError):  # it may have been deleted
-        place = str(Path.cwd())
-    request = _pickled((place, module, function.__qualname__, args, kwargs, memory_mb))
+        working_folder = str(Path.cwd())
+    request = _pickled((working_folder, module, function.__qualname__, args, kwargs, memory_mb))
     process = waiting.pop() if waiting else _started((module,))
     return Running(f"{module}:{function.__qualname__}", process, request, seconds)
 
@@ -101,7 +101,7 @@ class Running:
         self._timer = threading.Timer(seconds, self._stop)
         self._timer.daemon = True
         self._timer.start()
-        # The pipes are served from now on, so that the child never waits for result() to be asked for.
+        # A thread serves the pipes from now on, so that the child never waits for a call of result().
         self._talk = threading.Thread(target=self._converse, args=(request,), daemon=True)
         self._talk.start()
 
@@ -165,9 +165,10 @@ def _started(modules: tuple[str, ...]) -> subprocess.Popen:
 
 
 class _Pickler(pickle.Pickler):
-    """Pickle numpy's types by name.
+    """Pickle numpy's data types by their names.
 
-    An array that is unpickled otherwise has its own copy of the type, for which ufunc.at has no fast loops.
+    By default unpickling gives each array a copy of its type object. ufunc.at has fast loops only for numpy's own type
+    objects, and takes ten times as long with a copy.
     """
 
     def reducer_override(self, value: Any) -> Any:
@@ -198,11 +199,11 @@ def serve() -> None:
             with contextlib.suppress(Exception):  # reported when one of its functions is requested
                 importlib.import_module(module)
         try:
-            place, module, name, args, kwargs, memory_mb = pickle.load(file)
+            working_folder, module, name, args, kwargs, memory_mb = pickle.load(file)
         except EOFError:  # it was prepared and is not needed
             os._exit(0)
     with contextlib.suppress(OSError, TypeError):
-        os.chdir(place)
+        os.chdir(working_folder)
     answer = _answer(module, name, args, kwargs, memory_mb)
     with os.fdopen(answer_to, "wb") as file:
         file.write(_pickled(answer))
@@ -231,14 +232,14 @@ def _answer(module: str, name: str, args: tuple, kwargs: dict[str, Any], memory_
 
 
 def _limit_memory(megabytes: int) -> None:
-    """Let the address space of this process grow by so many megabytes, and no more."""
+    """Limit how much the address space of this process may still grow, in MB."""
     import resource
 
     with Path("/proc/self/statm").open() as file:
         now = int(file.read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    limit, most = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
-    if most != resource.RLIM_INFINITY:  # a child's child cannot have more than the child
-        limit = min(limit, most)
+    limit, hard_limit = now + megabytes * 2**20, resource.getrlimit(resource.RLIMIT_AS)[1]
+    if hard_limit != resource.RLIM_INFINITY:  # a child's child cannot have more than the child
+        limit = min(limit, hard_limit)
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 

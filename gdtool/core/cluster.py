@@ -17,22 +17,22 @@ AHEAD = 2
 def each(address: str, work: Callable[[str], Any], texts: Iterator[str], cores: int) -> Iterator[Any]:
     """Run work(text) for every text on the cluster at address; yields the results in the order in which they are done.
 
-    address: "local" starts Ray on this machine; else what `ray start` printed, "auto", or ray://HOST:PORT. cores: of
-    each task. work is pickled and runs in this process's working folder, which all nodes must share. It returns its
-    errors. A text whose worker dies (a native crash, no memory) yields a GdtoolError. Raises ResourceError without Ray
-    or cluster.
+    address: "local" starts Ray on this machine; else the address that `ray start` printed, "auto", or ray://HOST:PORT.
+    work: pickled, and run in this process's working folder, which all nodes must share; it has to return its errors,
+    not raise them. cores: how many processor cores each task takes. Where a worker process dies (a native crash, no
+    memory) the result is a GdtoolError. Raises ResourceError where Ray is not installed or no cluster answers.
     """
     ray = _connected(address)
     try:
-        task = ray.remote(num_cpus=cores, max_retries=1)(_within)
+        task = ray.remote(num_cpus=cores, max_retries=1)(_work_in_folder)
         folder = str(Path.cwd())
         waiting: dict[Any, str] = {}
         for text in texts:
             waiting[task.remote(folder, work, text)] = text
-            full = len(waiting) >= _room(ray, cores)
+            full = len(waiting) >= _task_slots(ray, cores)
             while full or _any_done(ray, waiting):
                 yield _next(ray, waiting)
-                full = len(waiting) >= _room(ray, cores)
+                full = len(waiting) >= _task_slots(ray, cores)
         while waiting:
             yield _next(ray, waiting)
     finally:
@@ -49,7 +49,7 @@ def _connected(address: str) -> Any:
     except ImportError:
         raise ResourceError("--ray", "needs the package ray", "pip install 'gdtool[ray]'") from None
     try:
-        _knock(address)
+        _require_listener(address)
         ray.init(
             None if address == "local" else address,
             log_to_driver=False,
@@ -66,25 +66,29 @@ def _connected(address: str) -> Any:
     return ray
 
 
-def _knock(address: str) -> None:
-    """Raise OSError when no process listens at HOST:PORT; Ray itself would try for minutes."""
+def _require_listener(address: str) -> None:
+    """Raise OSError where no process listens at HOST:PORT; Ray itself would retry for minutes."""
     host, _, port = address.removeprefix("ray://").rpartition(":")
     if host and port.isdecimal():
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
-def _room(ray: Any, cores: int) -> int:
-    """Return how many tasks may run now; a cluster may grow."""
+def _task_slots(ray: Any, cores: int) -> int:
+    """Return how many tasks may be submitted at a time.
+
+    These are one for each `cores` cores of the cluster, and two more (AHEAD) that wait. A cluster may grow, so the
+    cores are counted at each call.
+    """
     return max(int(ray.cluster_resources().get("CPU", 1)) // cores, 1) + AHEAD
 
 
 def _any_done(ray: Any, waiting: dict[Any, str]) -> bool:
-    """Tell whether a task is done, without waiting."""
+    """Tell, without waiting, whether a task has ended."""
     return bool(waiting) and bool(ray.wait(list(waiting), num_returns=1, timeout=0)[0])
 
 
 def _next(ray: Any, waiting: dict[Any, str]) -> Any:
-    """Wait for a task; returns its result, or a GdtoolError where its worker died."""
+    """Wait for a task to end; returns its result, or a GdtoolError where its worker process died."""
     (done,), _ = ray.wait(list(waiting), num_returns=1)
     text = waiting.pop(done)
     try:
@@ -96,8 +100,8 @@ def _next(ray: Any, waiting: dict[Any, str]) -> Any:
         return GdtoolError(text, f"its worker on the cluster failed ({reason[:120]})", "run it alone to see why")
 
 
-def _within(folder: str, work: Callable[[str], Any], text: str) -> Any:
-    """Run work in the driver's folder, to which relative paths refer."""
+def _work_in_folder(folder: str, work: Callable[[str], Any], text: str) -> Any:
+    """Run work in `folder`, the working folder of the process that submitted the task: relative paths refer to it."""
     from gdtool.core import log
 
     log.level = log.QUIET

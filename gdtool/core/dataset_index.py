@@ -13,9 +13,10 @@ from gdtool.core.ownership import refuse_index
 
 
 def write_dataset_index(root: Path, folders: Iterable[Path]) -> Path:
-    """Write the index at root over the given folders below it, and those of an earlier index that still exist.
+    """Write the dataset manifest at root: it lists `folders`, and the folders of an earlier index that still exist.
 
-    Raises UsageError where root has a manifest that is no index of gdtool's.
+    folders: views folders below root. Raises UsageError where root has a manifest.json that is not a dataset index
+    written by gdtool.
     """
     refuse_index(root)
     digests: dict[str, str] = {}

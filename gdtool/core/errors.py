@@ -1,4 +1,4 @@
-"""Errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
+"""Define the errors that a user reads: one line that names the subject, the fact and the cure, and an exit code."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ class GdtoolError(Exception):
 
 
 class UsageError(GdtoolError):
-    """Tell that the command line asks for something impossible."""
+    """Report that the command line asks for something impossible."""
 
     exit_code = 2
 
 
 class InputError(GdtoolError):
-    """Tell that a file, folder or manifest breaks the rules of its format."""
+    """Report that a file, folder or manifest breaks the rules of its format."""
 
     exit_code = 3
 
 
 class OutputError(GdtoolError):
-    """Tell that something cannot be read or written: permission, disk, lock."""
+    """Report that something cannot be read or written: permission, disk, lock."""
 
     exit_code = 4
 
 
 class ResourceError(GdtoolError):
-    """Tell that an optional dependency or a device is missing, or that a memory or time limit is reached."""
+    """Report that an optional dependency or a device is missing, or that a memory or time limit is reached."""
 
     exit_code = 5
 
 
 class ChildFailed(Exception):
-    """Tell that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
+    """Report that a child process crashed, ran out of time or memory, or ended without a result; str() says which."""
 
 
 # What to do about an error of the system, by its number.
@@ -81,16 +81,16 @@ _BAD_NAMES = {
 def from_os_error(error: OSError, subject: object) -> GdtoolError:
     """Turn an OSError into an error for the user; its subject is the error's file name, else `subject`.
 
-    InputError stands for names that are too long or lead in a circle, ResourceError for limits of the machine,
-    OutputError for all else.
+    Names that are too long and links that lead in a circle give InputError, limits of the machine ResourceError, all
+    else OutputError.
     """
     fact = error.strerror or str(error) or type(error).__name__
-    fact, place = fact[0].lower() + fact[1:], error.filename or subject
+    fact, named = fact[0].lower() + fact[1:], error.filename or subject
     if error.errno in _BAD_NAMES:
-        return InputError(place, fact, _BAD_NAMES[error.errno])
+        return InputError(named, fact, _BAD_NAMES[error.errno])
     if error.errno in _LIMITS:
-        return ResourceError(place, fact, _LIMITS[error.errno])
-    return OutputError(place, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
+        return ResourceError(named, fact, _LIMITS[error.errno])
+    return OutputError(named, fact, _CURES.get(error.errno or 0, "check that the disk and the folder can be used"))
 
 
 # The Debian package of each shared library that gdtool's dependencies are linked with.
@@ -159,8 +159,8 @@ def missing_library(error: ImportError) -> GdtoolError | None:
 def from_exception(error: Exception, subject: object) -> GdtoolError:
     """Turn any exception that was raised while working on subject into an error for the user.
 
-    A GdtoolError stays. Faults of the system, the memory, a device or a missing library become OutputError, InputError
-    or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
+    A GdtoolError is returned unchanged. Faults of the system, the memory, a device or a missing library become
+    OutputError, InputError or ResourceError. All else becomes a GdtoolError with exit code 1, "internal error".
     """
     if isinstance(error, GdtoolError):
         return error
@@ -168,7 +168,9 @@ def from_exception(error: Exception, subject: object) -> GdtoolError:
     first = first_line(error)
     native = isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] in ("cv2", "torch", "scipy")
     if isinstance(error, MemoryError) or native and _NO_MEMORY.search(str(error)):
-        problem = ResourceError(subject, "ran out of memory" + asked_for(error), "lower the resolution or free memory")
+        problem = ResourceError(
+            subject, "ran out of memory" + allocation_size(error), "lower the resolution or free memory"
+        )
     elif isinstance(error, OSError):
         problem = from_os_error(error, subject)
     elif isinstance(error, ImportError) and is_unmapped(error):
@@ -197,7 +199,7 @@ def is_unmapped(error: BaseException) -> bool:
     return bool(_NOT_MAPPED.search(str(error)))
 
 
-def asked_for(error: BaseException) -> str:
+def allocation_size(error: BaseException) -> str:
     """Return the size of the allocation that failed, in parentheses; empty where the message does not say."""
     request = _ASKED.search(str(error))
     if not request:

@@ -15,9 +15,9 @@ from gdtool.core.stage import Stage
 
 
 def option_record(options: Any, folder: Path | None) -> dict[str, Any]:
-    """Convert options to plain values, in which files stand by digest (for the key) or by path (for the manifest).
+    """Convert options to plain values: a file is recorded by its digest (for the key) or its path (for the manifest).
 
-    folder: the folder that paths are relative to; None for digests.
+    folder: the folder that paths are written relative to; None to record digests.
     """
     record = msgspec.to_builtins(options)
     for field in msgspec.structs.fields(options):

@@ -27,7 +27,9 @@ IDENTITY: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0,
 
 
 class Content(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base of all contents. source_from_world takes the normalised frame back to the source's own."""
+    """Fields that the content of every kind has. source_from_world takes points from the normalised frame to the frame
+    of the source.
+    """
 
     source_from_world: Matrix4 = IDENTITY
     report: Report = {}
@@ -44,7 +46,7 @@ class ViewsContent(Content, frozen=True, kw_only=True):
     clipped_share: Annotated[Share, Meta(description="share of foreground color values that clipped at 1")] = 0.0
     light: Annotated[bool, Meta(description="light.json holds the light as spherical Gaussians")] = False
     environment: Annotated[str, Meta(description="name of the environment the color was lit by; empty: unknown")] = ""
-    conditions: Annotated[int, Meta(ge=0, description="number of condition images, condition/000.png and on")] = 0
+    conditions: Annotated[int, Meta(ge=0, description="number of condition images, condition/000.png and so on")] = 0
     model: Annotated[bool, Meta(description="source.glb holds the model the views show")] = False
     picture: Annotated[
         str, Meta(description="name of the view that picture.png shows: what the views were made of; empty: none")
@@ -93,7 +95,7 @@ class MeshContent(Content, frozen=True, kw_only=True):
     triangles: Count
     watertight: bool
     engine: str = ""
-    tried: Annotated[tuple[str, ...], Meta(description="ways that were tried before, and why each was not taken")] = ()
+    tried: Annotated[tuple[str, ...], Meta(description="methods tried before, and why each was not used")] = ()
 
 
 class AtlasContent(Content, frozen=True, kw_only=True):
@@ -107,7 +109,7 @@ class AtlasContent(Content, frozen=True, kw_only=True):
     padding: Annotated[int, Meta(ge=0, description="texels between charts at that size")]
     coverage: Share
     watertight: bool = False
-    tried: Annotated[tuple[str, ...], Meta(description="ways that were tried before, and why each was not taken")] = ()
+    tried: Annotated[tuple[str, ...], Meta(description="methods tried before, and why each was not used")] = ()
 
 
 class AssetContent(Content, frozen=True, kw_only=True):
@@ -125,7 +127,7 @@ class AssetContent(Content, frozen=True, kw_only=True):
 
 
 class RendersContent(Content, frozen=True, kw_only=True):
-    """000.png and on: the lit object, straight alpha."""
+    """000.png, 001.png and so on: pictures of the lit object, straight alpha."""
 
     frames: Count
     environment: str

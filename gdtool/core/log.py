@@ -16,7 +16,7 @@ level = NORMAL
 _file: TextIO | None = None
 
 
-def keep_in(path: Path) -> None:
+def append_to(path: Path) -> None:
     """Append each line from now on to a file, with its time and whatever the verbosity. Raises OutputError."""
     global _file
     try:
@@ -27,10 +27,10 @@ def keep_in(path: Path) -> None:
 
 def printable(text: str) -> str:
     """Convert text to one line: escape control characters and line breaks, replace bytes that are not UTF-8."""
-    return "".join(_shown(c) for c in text)
+    return "".join(_escaped(c) for c in text)
 
 
-def _shown(character: str) -> str:
+def _escaped(character: str) -> str:
     """Escape a character that would break a line; replace a lone surrogate."""
     code = ord(character)
     if 0xD800 <= code < 0xE000:
@@ -41,7 +41,7 @@ def _shown(character: str) -> str:
 
 
 def line(text: str, shown: bool = True) -> None:
-    """Print text to stderr as one line, and append it to the file of keep_in().
+    """Print text to stderr as one line, and append it to the file of append_to().
 
     A stderr or a file that cannot be written (closed, on a full disk) does not stop the work.
     """

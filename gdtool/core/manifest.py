@@ -37,7 +37,7 @@ class FileEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InputEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a folder was made from."""
+    """One input that the folder was made from."""
 
     role: Annotated[str, Meta(description="source, or the name of the flag that gave it")]
     path: Annotated[str, Meta(description="relative to the folder, or procedural:SEED")]
@@ -109,12 +109,12 @@ def encode(manifest: Manifest) -> bytes:
 
 
 def _nearest(message: str, types: tuple[type[msgspec.Struct], ...]) -> str:
-    """Suggest the known field that is nearest to the unknown one of msgspec's message; empty for other messages."""
+    """Suggest the known field nearest to the unknown one in a message of msgspec; empty for other messages."""
     unknown = re.search(r"unknown field `([^`]+)`", message)
     if not unknown:
         return ""
-    known = {field for struct in types for field in struct.__struct_fields__}
-    near = difflib.get_close_matches(unknown[1], known, n=1)
+    known_fields = {field for struct in types for field in struct.__struct_fields__}
+    near = difflib.get_close_matches(unknown[1], known_fields, n=1)
     return f"did you mean {near[0]!r}?" if near else ""
 
 

@@ -14,10 +14,11 @@ from gdtool.core.errors import ResourceError
 SHARE = 0.5
 
 
-def most_held() -> int:
-    """Return the bytes that one input may take.
+def max_input_bytes() -> int:
+    """Return the most bytes that reading one input may take.
 
-    They are SHARE of this machine's memory, or of the limit on the address space (RLIMIT_AS) where that is smaller.
+    This is the share SHARE (one half) of the machine's memory, or of the limit on the address space (RLIMIT_AS) where
+    that is smaller.
     """
     most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
@@ -29,11 +30,12 @@ def most_held() -> int:
 
 
 def require_memory(size: int, subject: object, what: str, cure: str, most: int | None = None) -> None:
-    """Raise ResourceError, with the prediction, when `size` bytes are more than one input may take.
+    """Raise ResourceError where the content of an input is predicted to take more memory than one input may.
 
-    subject: the input. what: the part of it that would take them. most: a smaller limit in bytes than most_held().
+    size: the predicted bytes. subject: the input. what: the part of the input that takes them, for the message. most: a
+    limit in bytes, where it should be smaller than max_input_bytes().
     """
-    limit = most_held() if most is None else min(most, most_held())
+    limit = max_input_bytes() if most is None else min(most, max_input_bytes())
     if size > limit:
         raise ResourceError(
             subject,

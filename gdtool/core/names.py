@@ -46,7 +46,7 @@ def name_fault(text: str, byte_escapes: bool = False) -> str | None:
     if not text:
         return "is empty"
     if text in (".", ".."):
-        return "is no name of its own"
+        return "is not a name"
     if "/" in text or "\\" in text:
         return "holds a separator"
     if _DRIVE.match(text):
@@ -64,7 +64,7 @@ def checked_name(text: str, subject: object, what: str) -> str:
     """
     fault = name_fault(text)
     if fault:
-        raise InputError(subject, f"{what} {shown(text)} {fault}", CURE)
+        raise InputError(subject, f"{what} {quoted(text)} {fault}", CURE)
     return text
 
 
@@ -83,13 +83,13 @@ def path_inside(
         root, target = folder.resolve(), path.resolve()
     except (OSError, RuntimeError):  # a loop of links
         raise InputError(
-            subject, f"{what} {shown(relative)} is a link that leads nowhere", "replace the link by the file itself"
+            subject, f"{what} {quoted(relative)} is a link that leads nowhere", "replace the link by the file itself"
         ) from None
     for _ in range(levels_up):
         root = root.parent
     if not target.is_relative_to(root):
         raise InputError(
-            subject, f"{what} {shown(relative)} is a link that leaves {folder}", "replace the link by the file itself"
+            subject, f"{what} {quoted(relative)} is a link that leaves {folder}", "replace the link by the file itself"
         )
     return path
 
@@ -127,22 +127,22 @@ def relative_parts(
             if fault in ("is absolute", "leaves its folder", "begins with a drive")
             else CURE
         )
-        raise InputError(subject, f"{what} {shown(relative)} {fault}", cure)
+        raise InputError(subject, f"{what} {quoted(relative)} {fault}", cure)
     return tuple(parts)
 
 
 def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: int = 0) -> Path:
-    """Return the path of the file that a relative URI or a customary file name in a model stands for.
+    """Return the path of the file that a relative URI in a model stands for; plain file names are accepted too.
 
-    The URI is percent-decoded first and checked then. A file whose name has the percent signs of the URI comes first.
-    Backslashes count as slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
+    The URI is percent-decoded before it is checked. Where a file exists under the undecoded name, with its percent
+    signs, that file is taken. Backslashes count as slashes. A scheme (file:, http:, C:) is refused. Raises InputError.
     """
     decoded = unquote(uri)
     for text in (uri, decoded):
         if _SCHEME.match(text):
             raise InputError(
                 subject,
-                f"{what} {shown(uri)} names another place than a file",
+                f"{what} {quoted(uri)} does not name a local file",
                 "put the file beside or below the one that names it",
             )
     literal, plain = uri.replace("\\", "/"), decoded.replace("\\", "/")
@@ -154,9 +154,9 @@ def uri_path(folder: Path, uri: str, subject: object, what: str, *, levels_up: i
     return path
 
 
-def shown(text: str, most: int = 80) -> str:
+def quoted(text: str, max_length: int = 80) -> str:
     """Quote text for a message: escaped, and shortened where it is long."""
-    return ascii(text) if len(text) <= most else ascii(text[:most]) + "…"
+    return ascii(text) if len(text) <= max_length else ascii(text[:max_length]) + "…"
 
 
 def name_from_path(text: str) -> str:

@@ -32,11 +32,14 @@ def imported(module: str) -> ModuleType:
 
 
 def imported_if_installed(module: str) -> ModuleType | None:
-    """Import a module as imported() does; None where its package is not installed and something else can replace it."""
+    """Import a module as imported() does, or return None where its package is not installed.
+
+    It is for packages that the caller can do without.
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        if _is_of(error.name, module):
+        if _is_package_of(error.name, module):
             return None
         raise import_error(error, module) from None
     except (ImportError, OSError) as error:
@@ -55,7 +58,7 @@ def import_error(error: ImportError | OSError, module: str) -> GdtoolError | Mem
     distribution = _DISTRIBUTIONS.get(package, package)
     install = f"'{distribution}'" if "[" in distribution else distribution
     if isinstance(error, ModuleNotFoundError):
-        if _is_of(error.name, module):
+        if _is_package_of(error.name, module):
             return ResourceError(package, "is not installed", f"pip install {install}")
     else:
         problem = missing_library(ImportError(str(error), name=package))
@@ -86,6 +89,6 @@ def require_address_space(size: int, what: str) -> None:
         )
 
 
-def _is_of(missing: str | None, module: str) -> bool:
+def _is_package_of(missing: str | None, module: str) -> bool:
     """Tell whether the module that was not found is the requested one, or a package that contains it."""
     return bool(missing) and (module == missing or module.startswith(f"{missing}."))

@@ -1,7 +1,7 @@
-"""Decide whether a folder at the place of an output may be replaced.
+"""Decide whether a run may replace the folder at the path of its output, which may hold somebody's work.
 
-It may hold somebody's work. It is replaced only if it is empty, or a folder of the same kind that a stage wrote, with
-no file besides those that its manifest lists, each as it was written. `--force` does not change that.
+It may where the folder is empty. It may also where a stage wrote the folder, with the same kind, and every file in it
+is listed by its manifest and unchanged. `--force` does not change that.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ CURE = "name another output with -o"
 
 
 def output_place(path: Path) -> Path:
-    """Return where an output really lies: path, or the place that a link at path points to.
+    """Return the path of an output with a link at `path` followed.
 
-    A link is followed once, and stays. Raises UsageError for a link to a link, for a name with a line break, another
-    control character or NUL, and for anything at the place that is not a folder.
+    A link is followed once, and is not replaced. Raises UsageError for a link to a link, for a name with a line break,
+    another control character or NUL, and where something else than a folder lies at the result.
     """
     fault = text_fault(str(path), byte_escapes=True)
     if fault:
@@ -53,16 +53,17 @@ def refuse_overlap(place: Path, sources: Iterable[Path]) -> None:
 
 
 def refuse_loss(place: Path, kind: str) -> None:
-    """Raise UsageError, naming the file, where a result of this kind would replace something of the user's.
+    """Raise UsageError, naming the file, where a result of this kind would replace a file of the user's.
 
-    Reads every listed file, to compare its digest.
+    That is a file which gdtool did not write, or which was changed since. Reads every listed file, to compare its
+    digest.
     """
     if not os.path.lexists(place):
         return
     present = _files_below(place)
     if not present:
         return
-    manifest = _own_manifest(place, present)
+    manifest = _manifest_to_replace(place, present)
     if manifest.kind != kind:
         raise UsageError(place, f"holds {manifest.kind}, not {kind}", CURE)
     if not (manifest.stage and manifest.stage_version and manifest.key):
@@ -86,15 +87,15 @@ def refuse_index(root: Path) -> None:
     """Raise UsageError where root has a manifest.json that is not a dataset index written by gdtool."""
     if not (root / MANIFEST).exists():
         return
-    manifest = _own_manifest(root, [MANIFEST])
+    manifest = _manifest_to_replace(root, [MANIFEST])
     if manifest.kind != "dataset" or not manifest.tool_version:
         raise UsageError(root / MANIFEST, f"describes {manifest.kind}, not a dataset that gdtool wrote", CURE)
 
 
-def _own_manifest(place: Path, present: list[str]) -> Manifest:
-    """Read the manifest of a folder that a run would replace. Raises UsageError where there is none of gdtool's."""
+def _manifest_to_replace(place: Path, present: list[str]) -> Manifest:
+    """Read the manifest of a folder that a run would replace. Raises UsageError where gdtool wrote none there."""
     if MANIFEST not in present:
-        raise UsageError(place / present[0], "is in the way, and gdtool did not write that folder", CURE)
+        raise UsageError(place / present[0], "would be deleted, and gdtool did not write that folder", CURE)
     try:
         return read_manifest(place)
     except InputError as error:

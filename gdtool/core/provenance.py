@@ -20,7 +20,9 @@ from gdtool.core.names import relative_parts
 
 @dataclass(frozen=True)
 class Origin:
-    """Hold an input that the manifest of the folder `of` lists, and its absolute path."""
+    """Hold an input that a folder was made from: the folder `of`, the entry of its manifest, and the input's absolute
+    path.
+    """
 
     of: Folder
     entry: InputEntry
@@ -46,7 +48,7 @@ class Origin:
 def origins(folder: Folder) -> Iterator[Origin]:
     """Yield the inputs that a folder's manifest lists, without generated objects.
 
-    Paths in manifests are relative to where the folder really lies.
+    Paths in manifests are relative to the folder with its links resolved.
     """
     for entry in folder.manifest.inputs:
         if not entry.path.startswith("procedural:"):
@@ -100,9 +102,11 @@ def missing_origin(folder: Folder, cure: str) -> Origin | None:
 
 
 def find_source(folder: Folder, cure: str) -> str | None:
-    """Return the first input along the chain that is not a folder: a file path or procedural:SEED; None without.
+    """Return the first input along the provenance chain that is not a folder: a file path or procedural:SEED; None
+    without.
 
-    Raises InputError where the file or a folder on the way was replaced since; cure as for ancestors().
+    cure: what to do about an input that was replaced since, for the message. Raises InputError where the file, or a
+    folder on the way to it, has another digest than the manifest lists.
     """
     for member in (folder, *ancestors(folder, cure)):
         for entry in member.manifest.inputs:

@@ -31,14 +31,14 @@ _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
     """Hold the lock of a target, and wait where another process has it. Raises OutputError after wait_seconds."""
     path = target.parent / f".{target.name}.lock"
-    deadline, told = time.monotonic() + wait_seconds, False
+    deadline, is_announced = time.monotonic() + wait_seconds, False
     while True:
         handle = os.open(path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o666)
         if os.fstat(handle).st_size:  # gdtool's lock is empty, and is removed in the end
             os.close(handle)
             raise OutputError(
                 path,
-                "is in the way of the output's lock, and gdtool did not write it",
+                "stands where the output's lock file belongs, and gdtool did not write it",
                 "move it away, or choose another -o",
             )
         try:
@@ -53,12 +53,12 @@ def locked(target: Path, wait_seconds: float = 3600.0) -> Iterator[None]:
         os.close(handle)
         if time.monotonic() > deadline:
             raise OutputError(target, "is being written by another process", "wait for it or choose another -o")
-        if not told:
+        if not is_announced:
             log.say(f"{target}: another process is writing it; waiting")
-            told = True
+            is_announced = True
         time.sleep(0.05)
     try:
-        with ending.certainly(lambda: path.unlink(missing_ok=True)):
+        with ending.guaranteed_clean_up(lambda: path.unlink(missing_ok=True)):
             yield
     finally:
         os.close(handle)
@@ -78,12 +78,15 @@ def workspace_path(target: Path, key: str) -> Path:
 
 
 def _beside(target: Path, key: str, use: str) -> Path:
-    """Return the path of one of the folders beside the target."""
+    """Return the hidden path `.<target>.<key>.<use>` beside the target; use: "partial", "old" or "work"."""
     return target.parent / f".{target.name}.{key[:KEY_DIGITS]}.{use}"
 
 
-def _left_beside(target: Path, *uses: str) -> list[Path]:
-    """List the folders that runs of this output, and of no other, have left beside it."""
+def _leftovers(target: Path, *uses: str) -> list[Path]:
+    """List the hidden folders beside the target that its runs have left.
+
+    uses: "partial", "old" or "work", the last part of their names.
+    """
     pattern = re.compile(re.escape(f".{target.name}.") + f"[0-9a-f]{{{KEY_DIGITS}}}" + r"\.(" + "|".join(uses) + ")")
     return sorted(
         path
@@ -98,23 +101,23 @@ def clear_stale(target: Path) -> None:
     Under the lock no run of this output is alive. Workspaces stay, those of other options too: they may hold hours of a
     training. clear_workspaces() removes them after a publication.
     """
-    for old in _left_beside(target, "old"):
+    for old in _leftovers(target, "old"):
         if target.exists():
             remove_tree(old)
         else:  # killed between the two renames of a file system without exchange
             old.rename(target)
-    for path in _left_beside(target, "partial"):
+    for path in _leftovers(target, "partial"):
         remove_tree(path)
 
 
 def clear_workspaces(target: Path) -> None:
     """Remove the workspaces of this output, which is finished. The lock must be held."""
-    for path in _left_beside(target, "work"):
+    for path in _leftovers(target, "work"):
         remove_tree(path)
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of gdtool's as far as the system permits; a link is not followed.
+    """Remove a folder that gdtool wrote, as far as the system permits; a link is not followed.
 
     Folders that a umask has left without permissions are removed as well.
     """
@@ -135,7 +138,7 @@ def require_replaceable(target: Path) -> None:
     for root, _, _ in os.walk(target):
         if not os.access(root, os.W_OK | os.X_OK):
             raise OutputError(
-                root, "cannot be replaced: it is closed to writing", "check its permissions or choose another -o"
+                root, "cannot be replaced: it is not writable", "check its permissions or choose another -o"
             )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from gdtool.core.errors import InputError, from_os_error
 from gdtool.core.memory import require_memory
-from gdtool.core.names import shown, text_fault
+from gdtool.core.names import quoted, text_fault
 
 MAX_INTEGER_DIGITS = 19  # of a 64-bit integer
 
@@ -26,18 +26,20 @@ _SPECIAL = (
 def require_regular_file(path: Path) -> None:
     """Raise InputError unless path is a regular file or a link to one: reading a FIFO or a device may never end.
 
-    Raises OutputError where the system does not let it be looked at.
+    Raises OutputError where the system denies access to it.
     """
     try:
         mode = Path(path).stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(path, "does not exist", "check the path") from None
     except ValueError:  # a NUL in the name
-        raise InputError(shown(str(path)), "is no name of a file", "check the path") from None
+        raise InputError(quoted(str(path)), "is not a file name", "check the path") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
             raise InputError(
-                shown(str(path)), error.strerror.lower() if error.strerror else "is no name of a file", "check the path"
+                quoted(str(path)),
+                error.strerror.lower() if error.strerror else "is not a file name",
+                "check the path",
             ) from None
         raise from_os_error(error, path) from None
     kind = next((name for test, name in _SPECIAL if test(mode)), None)
@@ -86,14 +88,14 @@ def parse_json(content: bytes | str, subject: object) -> Any:
         raise InputError(subject, f"is not JSON (byte {error.start} is not UTF-8)", "save it as UTF-8") from None
     except json.JSONDecodeError as error:
         raise InputError(subject, f"is not JSON: {error.msg} in line {error.lineno}", "correct that line") from None
-    place = _unfit_string(value)
-    if place:
-        raise InputError(subject, place, "correct that entry")
+    string_fault = _unfit_string(value)
+    if string_fault:
+        raise InputError(subject, string_fault, "correct that entry")
     return value
 
 
 class _Refused(Exception):
-    """Tell that a value of the JSON is not accepted; str() says which and why."""
+    """Report that a value of the JSON is not accepted; str() says which and why."""
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -101,7 +103,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for key, value in pairs:
         if key in out:
-            raise _Refused(f"key {shown(key)} appears twice")
+            raise _Refused(f"key {quoted(key)} appears twice")
         out[key] = value
     return out
 
@@ -133,7 +135,7 @@ def _unfit_string(value: Any) -> str | None:
         place, part = waiting.pop()
         if isinstance(part, dict):
             waiting += [(f"{place}.{key}", inner) for key, inner in part.items()]
-            waiting += [(f"key {shown(key)} of {place or 'the whole'}", key) for key in part if not key.isascii()]
+            waiting += [(f"key {quoted(key)} of {place or 'the whole'}", key) for key in part if not key.isascii()]
         elif isinstance(part, list):
             waiting += [
                 (f"{place}[{i}]", inner) for i, inner in enumerate(part) if isinstance(inner, (str, dict, list))

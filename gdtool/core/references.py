@@ -41,28 +41,29 @@ _OPTION_WORDS = {
 def obj_file(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
     """Return the path that a name in an .obj or .mtl stands for.
 
-    model: the .obj. folder: what the name is relative to, itself relative to the model's folder. Backslashes count as
-    slashes, and of an absolute name only the last part is used. subject, what: as in path_inside(). Returns None for an
-    empty name or ".", by which exporters mean no file. Raises InputError for a name that leads more than one folder
-    above the model's, links followed.
+    model: the .obj. name: backslashes count as slashes, and of an absolute name only the last part is used. subject:
+    the file that holds the name, and what: the thing that it names, both for messages. folder: the folder that the name
+    is relative to, itself relative to the model's folder. Returns None for an empty name or ".", by which exporters
+    mean no file. Raises InputError for a name that leads more than one folder above the model's, links followed.
     """
-    plain = _plain(name)
+    plain = _without_quotes(name)
     if plain in ("", "."):
         return None
     return path_inside(model.parent, f"{folder}/{plain}".lstrip("/"), subject, what, levels_up=OBJ_LEVELS_UP)
 
 
 def obj_texture(model: Path, name: str, subject: Path, what: str, folder: str = "") -> Path | None:
-    """Return the path of the texture that a name in an .mtl stands for, as obj_file() does.
+    """Return the path of the texture that a name in an .mtl stands for.
 
-    It is looked for in TEXTURE_PLACES; the path in the first is returned where none has it. Raises InputError also for
-    a FIFO, a device or a socket.
+    model, name, subject, what, folder: as for obj_file(). The file is looked for in several folders (TEXTURE_PLACES);
+    where none has it, the path in the first is returned. Raises InputError as obj_file() does, and for a FIFO, a device
+    or a socket.
     """
     first = obj_file(model, name, subject, what, folder)
     if first is None:
         return None
-    for place in TEXTURE_PLACES:
-        relative = "/".join(part for part in (folder, place, _plain(name)) if part)
+    for texture_folder in TEXTURE_PLACES:
+        relative = "/".join(part for part in (folder, texture_folder, _without_quotes(name)) if part)
         try:
             relative_parts(relative, subject, what, levels_up=OBJ_LEVELS_UP)
         except InputError:  # the name leads out of this place
@@ -92,20 +93,24 @@ def obj_libraries(model: Path, line: str) -> Iterator[tuple[str, Path]]:
 
 def library_folder(name: str) -> str:
     """Return the folder of a library that an mtllib line names, relative to the model's."""
-    return _plain(name).rpartition("/")[0]
+    return _without_quotes(name).rpartition("/")[0]
 
 
 def map_name(words: list[str]) -> tuple[str, str | None]:
-    """Return the name and the -imfchan of a texture statement, without the other options."""
+    """Return the file name of a texture statement, and the value of its option -imfchan (a channel) or None.
+
+    Its other options are dropped.
+    """
     channel, i = None, 0
     while i < len(words) and words[i] in _OPTION_WORDS:
         count = _OPTION_WORDS[words[i]]
         if words[i] == "-imfchan" and i + 1 < len(words):
             channel = words[i + 1]
-        taken = 0
-        while taken < count and i + 1 + taken < len(words) - 1 and (count < 3 or _is_number(words[i + 1 + taken])):
-            taken += 1
-        i += 1 + taken
+        number_count = 0
+        most = min(count, len(words) - 2 - i)
+        while number_count < most and (count < 3 or _is_number(words[i + 1 + number_count])):
+            number_count += 1
+        i += 1 + number_count
     return " ".join(words[i:]), channel
 
 
@@ -190,8 +195,8 @@ def _obj_files(path: Path) -> list[Path]:
     return out
 
 
-def _plain(name: str) -> str:
-    """Return a name without quotes, with forward slashes; of an absolute one the last part."""
+def _without_quotes(name: str) -> str:
+    """Return a name without quotes and with forward slashes; of an absolute name only the last part."""
     plain = name.strip().strip('"').replace("\\", "/")
     return plain.rsplit("/", 1)[-1] if plain.startswith("/") or plain[1:3] == ":/" else plain
 

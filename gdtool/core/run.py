@@ -15,7 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 from gdtool import __version__
 from gdtool.core import ending, log, sources
-from gdtool.core.errors import ResourceError, UsageError, asked_for, from_os_error
+from gdtool.core.errors import ResourceError, UsageError, allocation_size, from_os_error
 from gdtool.core.folder import Folder, is_folder
 from gdtool.core.keys import key_of, option_record, stale_reason
 from gdtool.core.manifest import MANIFEST, InputEntry, Manifest, RunRecord, encode, list_files, read_manifest
@@ -37,7 +37,7 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 @dataclass(frozen=True)
 class Settings:
-    """Hold how to run, as against what to make: none of it enters the key."""
+    """Hold settings of how to run, which do not change what is made: none of them enters the key."""
 
     output: Path | None = None
     several: bool = False
@@ -63,7 +63,7 @@ class Result:
 
 
 class ReadInput(NamedTuple):
-    """An input of a run: its role in the manifest, itself, and its digest."""
+    """Hold an input of a run: its role in the manifest, the source, and the sha256 of its content."""
 
     role: str
     source: Source
@@ -72,10 +72,10 @@ class ReadInput(NamedTuple):
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a stage: what it reads, where its result goes, and the key that identifies the result.
+    """Hold one run of a stage: what it reads, where its result goes, and the key that identifies the result.
 
-    named: the output as the user names it. target: where it really lies, which differs where a link lies at named.
-    options: as the manifest records them. warnings: what to tell before the run.
+    named: the output path as the user names it. target: the path it resolves to, which differs where `named` is a link.
+    options: plain values, as the manifest records them. warnings: lines to show before the run.
     """
 
     stage: Stage
@@ -146,8 +146,8 @@ def _run_and_publish(job: Job, options: Any, settings: Settings, start: float) -
     partial, workspace = partial_path(target, job.key), workspace_path(target, job.key)
     out = Output(partial, workspace, settings.threads or os.cpu_count() or 1, settings.device)
     with (
-        ending.certainly(functools.partial(_drop_workspace, stage, workspace)),
-        ending.certainly(functools.partial(remove_tree, partial)),
+        ending.guaranteed_clean_up(functools.partial(_drop_workspace, stage, workspace)),
+        ending.guaranteed_clean_up(functools.partial(remove_tree, partial)),
     ):
         for text in job.warnings:
             out.warn(text)
@@ -174,7 +174,7 @@ def _run_stage(job: Job, options: Any, out: Output) -> None:
     except MemoryError as error:
         raise ResourceError(
             job.inputs.name,
-            f"{job.stage.name} ran out of memory{asked_for(error)}",
+            f"{job.stage.name} ran out of memory{allocation_size(error)}",
             "lower the resolution or free memory",
         ) from None
     if out.content is None:
@@ -250,15 +250,15 @@ def _paths(inputs: Iterable[Source | None]) -> list[Path]:
 @contextlib.contextmanager
 def _parents(target: Path) -> Iterator[None]:
     """Make the folders above target; those that stay empty, because the run failed, are removed again."""
-    made = [folder for folder in target.parents if not folder.exists()]
+    missing = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
 
     def remove_empty() -> None:
         with contextlib.suppress(OSError):
-            for folder in made:
+            for folder in missing:
                 folder.rmdir()
 
-    with ending.certainly(remove_empty):
+    with ending.guaranteed_clean_up(remove_empty):
         yield
 
 

@@ -16,7 +16,10 @@ from gdtool.core.stage import SecondInput, Stage
 
 @dataclass(frozen=True)
 class SecondInputs:
-    """The inputs beside the source by flag, None where there is none, and warnings about inputs that are gone."""
+    """Hold the inputs beside the source, by the flag that names each: None for one that was not found.
+
+    warnings: lines about inputs that a manifest lists and that do not exist any more.
+    """
 
     by_flag: dict[str, Folder | Path | None]
     warnings: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from gdtool.core.errors import InputError, ResourceError, UsageError
 from gdtool.core.folder import Folder, is_folder, open_folder
 from gdtool.core.kinds import MADE_BY
 from gdtool.core.manifest import digest_of, file_sha256
-from gdtool.core.names import name_from_path, shown, text_fault
+from gdtool.core.names import name_from_path, quoted, text_fault
 from gdtool.core.reading import MAX_INTEGER_DIGITS, parse_json, require_regular_file
 from gdtool.core.references import referred_files
 
@@ -24,21 +24,26 @@ PICTURES = "pictures"  # a kind of source: a folder of another program, without 
 
 
 def expand(text: str) -> Iterator[str]:
-    """Expand procedural:A..B to its seeds; any other text stays. Raises UsageError for a malformed range."""
+    """Expand procedural:A..B to one source for each seed; any other text is returned unchanged.
+
+    Raises UsageError for a malformed range.
+    """
     if not text.startswith("procedural:"):
         yield text
         return
     match = PROCEDURAL.fullmatch(text)
     if not match:
         raise UsageError(
-            shown(text), "is not procedural:SEED or procedural:FIRST..LAST", "give whole numbers, as in procedural:0..9"
+            quoted(text),
+            "is not procedural:SEED or procedural:FIRST..LAST",
+            "give whole numbers, as in procedural:0..9",
         )
     if any(len(digits) > MAX_INTEGER_DIGITS or int(digits) >= 2**63 for digits in (match[1], match[2] or "0")):
-        raise UsageError(shown(text), "has a seed beyond 64 bits", f"give seeds up to {2**63 - 1}")
+        raise UsageError(quoted(text), "has a seed beyond 64 bits", f"give seeds up to {2**63 - 1}")
     first = int(match[1])
     last = first if match[2] is None else int(match[2])
     if last < first:
-        raise UsageError(shown(text), "ends before it begins", f"write procedural:{last}..{first}")
+        raise UsageError(quoted(text), "ends before it begins", f"write procedural:{last}..{first}")
     for seed in range(first, last + 1):
         yield f"procedural:{seed}" if match[2] else text
 
@@ -46,8 +51,8 @@ def expand(text: str) -> Iterator[str]:
 def incoming(arguments: tuple[str, ...]) -> Iterator[str]:
     """Yield sources in order: the arguments, or without any the lines of stdin, each as soon as it arrives.
 
-    Raises UsageError when both are empty, since a pipe whose first stage failed fails as a whole. Arguments that cannot
-    be sources raise it before any of them is worked on.
+    Raises UsageError where both are empty: then the command before the pipe has failed, and the whole pipe has to fail.
+    Arguments that cannot be sources raise UsageError before the first source is worked on.
     """
     empty = True
     for text in arguments:
@@ -85,13 +90,13 @@ def _folder_of(raw: bytes, line: str) -> str | None:
         record = parse_json(raw, "stdin")
     except InputError as error:
         raise UsageError(
-            "stdin", f"line {shown(line, 60)} {error.fact}", "pipe in paths, or what --json prints"
+            "stdin", f"line {quoted(line, 60)} {error.fact}", "pipe in paths, or what --json prints"
         ) from None
     if isinstance(record, dict) and "folder" in record and isinstance(record["folder"], str | None):
         return record["folder"]
     raise UsageError(
         "stdin",
-        f"line {shown(line, 60)} is neither a path nor an object of --json",
+        f"line {quoted(line, 60)} is neither a path nor an object of --json",
         "pipe in paths, or what --json prints",
     )
 
@@ -100,7 +105,7 @@ def _checked(text: str) -> str:
     """Return a source that is one line of text. Raises UsageError for control characters and NUL."""
     fault = text_fault(text, byte_escapes=True)
     if fault:
-        raise UsageError(shown(text), fault, "rename it without that character")
+        raise UsageError(quoted(text), fault, "rename it without that character")
     return text
 
 
@@ -142,9 +147,10 @@ HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+$")
 
 
 def hub_folder(text: str, revision: str = "") -> str:
-    """Return the folder of a Hugging Face hub id, downloaded once; any other text, and an existing path, stays.
+    """Return the folder of a Hugging Face hub id, downloaded once; an existing path and text that is no id are returned
+    unchanged.
 
-    revision: a branch, tag or commit; "": the main branch. Raises ResourceError without huggingface_hub, InputError
+    revision: a branch, tag or commit; "" is the main branch. Raises ResourceError without huggingface_hub, InputError
     where the download fails.
     """
     if Path(text).exists() or not HUB_ID.match(text):
@@ -154,7 +160,7 @@ def hub_folder(text: str, revision: str = "") -> str:
     except ImportError:
         raise ResourceError(
             text,
-            "does not exist here, and huggingface_hub is not installed to ask the hub for it",
+            "does not exist here, and huggingface_hub, which could download it, is not installed",
             "pip install 'gdtool[hub]', or give a local folder",
         ) from None
     try:
@@ -162,7 +168,7 @@ def hub_folder(text: str, revision: str = "") -> str:
     except Exception as error:  # of several libraries: no network, no such id, no permission
         raise InputError(
             text,
-            f"is no folder here, and the hub does not give it ({type(error).__name__})",
+            f"is not a folder here, and cannot be downloaded from the hub ({type(error).__name__})",
             "check the id and the network, or give a local folder",
         ) from None
 
@@ -191,7 +197,9 @@ def digest(source: Source) -> str:
 
 
 def relative_to(path: Path | str, folder: Path) -> str:
-    """Return path relative to where folder really lies, with forward slashes; procedural:SEED stays as it is."""
+    """Return path relative to folder, links in folder resolved, with forward slashes; procedural:SEED is returned
+    unchanged.
+    """
     if isinstance(path, str):
         return path
     # Where both really lie, but for a link that the path itself is: ".." from a folder reached by a link does not lead

@@ -29,10 +29,11 @@ FILE = {"file": True}
 
 @dataclass(frozen=True)
 class SecondInput:
-    """Declare an input beside the source: it has a flag, and with `search` is found along the provenance chain.
+    """Declare an input beside the source, which the user names by a flag.
 
-    default: a folder that ships with gdtool, as "package/folder", where neither gives one. foreign: a folder of another
-    program, or an id of the Hugging Face hub, is accepted too, and arrives as a Path.
+    search: without the flag it is looked for along the provenance chain. default: the folder to take where neither
+    gives one, as "package/folder" of what ships with gdtool. foreign: a folder of another program, or an id of the
+    Hugging Face hub, is accepted too, and is passed as a Path.
     """
 
     kind: str
@@ -72,14 +73,16 @@ class Inputs:
         return tuple(source for source in self.all if not isinstance(source, str))
 
     def second_folder(self, flag: str) -> Folder | None:
-        """Return a second input that is a folder of gdtool's, or None. Raises TypeError for another program's."""
+        """Return a second input as a folder that gdtool wrote, or None. Raises TypeError for a folder of another
+        program.
+        """
         folder = self.second.get(flag)
         if isinstance(folder, Path):
             raise TypeError(f"{folder} is not a folder with a manifest")
         return folder
 
     def second_path(self, flag: str) -> Path | None:
-        """Return where a second input lies, whatever wrote it; None where there is none."""
+        """Return the path of a second input, whichever program wrote it; None where there is none."""
         source = self.second.get(flag)
         return source.path if isinstance(source, Folder) else source
 
@@ -88,12 +91,12 @@ class Inputs:
 class Stage:
     """Declare a stage; its command line, its manifest and its schema are derived from this.
 
-    reads: folder kinds, and "image-file", "model-file", "mesh-file" for files. version: raised when results change.
-    gathers: all sources go into one run (train). dataset: several results share a root with an index. check(inputs,
-    options): called before any work; it takes no time, and raises a GdtoolError for what the run would find out only
-    later (a file that an option names, a package that it needs). checkpoint: the file of the workspace that a later run
-    goes on from; without it a failed run leaves no workspace. networks: the stage runs neural networks, so its command
-    takes --device.
+    reads: the kinds of folder that it reads, and "image-file", "model-file", "mesh-file" for files. version: raised
+    when results change. gathers: all sources go into one run (train). dataset: the results of several sources lie below
+    one root, with an index. check(inputs, options): called before any work. It is quick, and raises a GdtoolError for
+    what the run would notice only later: a file that an option names is missing, or a package. checkpoint: the file of
+    the workspace that a later run can resume from; without it a failed run leaves no workspace. networks: the stage
+    runs neural networks, so its command has --device.
     """
 
     name: str

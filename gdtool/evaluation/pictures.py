@@ -121,12 +121,12 @@ def _cameras_by_name(folder: Folder) -> dict[str, Camera]:
 
 
 def _buffer(name: str) -> Callable[[Buffers], np.ndarray]:
-    """Make a function that takes one of a frame's buffers."""
+    """Return a function that returns one of the buffers of a rendered frame, by its name."""
     return lambda buffers: buffers[name]
 
 
 def _albedo_channel(index: int) -> Callable[[Buffers], np.ndarray]:
-    """Make a function that takes one channel of a frame's base color."""
+    """Return a function that returns one channel (0 to 2) of the base color of a rendered frame."""
     return lambda buffers: buffers["albedo"][..., index]
 
 

@@ -16,7 +16,7 @@ CURE = "name what to measure against with --reference"
 
 
 def kind_of(source: Source | None) -> str:
-    """Return a folder's kind, MODEL for a model file or a generated object, and "" for None."""
+    """Return the kind of a folder, "model" for a model file or a generated object, and "" for None."""
     if isinstance(source, Folder):
         return source.kind
     return "" if source is None else MODEL
@@ -28,7 +28,7 @@ def path_of(source: Source) -> Path | str:
 
 
 def has_material(source: Source) -> bool:
-    """Tell whether a source has materials that views can be compared with: a mesh without materials has not."""
+    """Tell whether a source has materials that views can be compared with; a mesh file may have none."""
     return kind_of(source) in ("asset", "surface", MODEL)
 
 
@@ -58,9 +58,10 @@ def find_truth(result: Source) -> Source | None:
 
 
 def source_of_shape(reference: Source) -> Source | None:
-    """Return the source that has the reference's triangles; None where it has none.
+    """Return the source of the triangles that a shape is compared with; None where there is none.
 
-    Views have them in the model that they carry, or in the one that they were rendered from.
+    reference: a model, or a folder of views. Views have no triangles: their model is taken, which is either stored in
+    the folder or the one that they were rendered from.
     """
     if kind_of(reference) == "renders":
         return None

@@ -46,8 +46,9 @@ class ShapeOptions:
     """Choose how two shapes are compared.
 
     frame: how a model file is brought into the result's frame, "auto", "source", "box" or "same" (see aligned_truth).
-    samples: points drawn on each surface, by seed. threshold: the distance that counts as a match in the F-score, in
-    shares of the reference's largest extent. syncdreamer: measure by the protocol of the published tables too.
+    samples: number of points drawn on each surface. seed: of their random positions. threshold: the distance that
+    counts as a match in the F-score, in shares of the reference's largest extent. syncdreamer: compute the figures of
+    the published SyncDreamer protocol too.
     """
 
     frame: str

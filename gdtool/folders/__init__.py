@@ -1,1 +1,1 @@
-"""Read and write the files of each kind of folder, typed; the JSON Schemas are generated from the types."""
+"""Read and write the files of each kind of folder as typed values; the JSON Schemas are generated from the types."""

@@ -37,8 +37,10 @@ def read_obj(path: Path) -> QuadMesh:
 
     lines = read_lines(path)
     points, coordinates = lines.vertices, lines.uvs * (1, -1) + (0, 1)
-    place = _cut(lines.sizes)
-    quads, corners = (np.where(place >= 0, lines.corners[:, column].astype(np.int32)[place], -1) for column in (0, 1))
+    corner_idx = _cut(lines.sizes)
+    quads, corners = (
+        np.where(corner_idx >= 0, lines.corners[:, column].astype(np.int32)[corner_idx], -1) for column in (0, 1)
+    )
     if quads.max() >= len(points):
         raise InputError(
             path,
@@ -63,9 +65,10 @@ def read_obj(path: Path) -> QuadMesh:
 
 
 def _cut(sizes: np.ndarray) -> np.ndarray:
-    """Cut polygons into quads and triangles, which have -1 as fourth corner; returns (q, 4) places among all corners.
+    """Cut polygons into quads and triangles, whose fourth corner is -1.
 
-    sizes (p,): the number of corners of each polygon.
+    sizes (p,): the number of corners of each polygon. Returns indices (q, 4) into the corners of all polygons, one
+    polygon after the other.
     """
     first = np.cumsum(sizes) - sizes
     pieces = (sizes - 1) // 2

@@ -1,4 +1,4 @@
-"""Load the scene of whatever holds a textured model: an asset folder, a model file, or a generated object."""
+"""Load the scene of a textured model: an asset folder, a model file, or a generated object."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> None:
     _write(path, Cameras(tuple(records)))
 
 
-def read_record(path: Path) -> dict[str, Any]:
+def read_light(path: Path) -> dict[str, Any]:
     """Read light.json as plain values: axes, sharpness and amplitudes become float64 arrays (k, 3), (k,), (k, 3)."""
     light = _convert(path, Light)
     if not len(light.axes) == len(light.sharpness) == len(light.amplitudes):
@@ -142,7 +142,7 @@ def read_record(path: Path) -> dict[str, Any]:
     }
 
 
-def write_record(path: Path, light: dict[str, Any]) -> None:
+def write_light(path: Path, light: dict[str, Any]) -> None:
     """Write light.json from arrays axes, sharpness and amplitudes (and environment, fit_error where known)."""
     plain = json.loads(
         json.dumps(

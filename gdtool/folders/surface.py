@@ -14,7 +14,7 @@ from gdtool.core.folder import Folder
 from gdtool.core.kinds import IDENTITY, SurfaceContent
 from gdtool.core.reading import bytes_of
 from gdtool.core.stage import Output
-from gdtool.folders.records import read_record, write_record
+from gdtool.folders.records import read_light, write_light
 from gdtool.geometry.meshes import TriMesh
 
 # albedo is 8-bit sRGB under the names that viewers show.
@@ -67,7 +67,7 @@ def write_surface(
     """Write surface.ply (and light.json) and set out.content; extra goes to SurfaceContent (report, field)."""
     write_surface_ply(out.path("surface.ply"), surface)
     if surface.light is not None:
-        write_record(out.path("light.json"), surface.light)
+        write_light(out.path("light.json"), surface.light)
     matrix = IDENTITY if source_from_world is None else tuple(float(x) for x in np.asarray(source_from_world).ravel())
     out.content = SurfaceContent(
         vertices=len(surface.vertices),
@@ -147,7 +147,7 @@ def read_surface(folder: Folder) -> Surface:
     else:
         albedo = np.full((len(vertex), 3), 0.8, np.float32)
     normals = columns(vertex, "nx ny nz").astype(np.float32) if {"nx", "ny", "nz"} <= set(names) else None
-    light = read_record(folder.file("light.json")) if folder.content_as(SurfaceContent).light else None
+    light = read_light(folder.file("light.json")) if folder.content_as(SurfaceContent).light else None
     return Surface(
         vertices,
         faces.astype(np.int32),

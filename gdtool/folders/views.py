@@ -14,10 +14,10 @@ from gdtool.core.folder import Folder
 from gdtool.core.kinds import DOMAINS, IDENTITY, Domain, ViewsContent
 from gdtool.core.memory import require_memory
 from gdtool.core.stage import Output
-from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
+from gdtool.folders.records import read_cameras, read_light, write_cameras, write_light
 
 CHANNELS = {"color": 3, "normal": 3, "depth": 1, "albedo": 3, "roughness": 1, "metallic": 1, "closed_form": 3}
-_PASSING = 5  # copies of a domain's pictures that exist at once while they are stacked, decoded and masked
+_PASSING = 5  # copies of a domain's pictures in memory at one time, while they are stacked, decoded and masked
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
             "does not hold the views that the manifest lists, in that order",
             "list the same views in both",
         )
-    wanted = [d for d in content.domains if domains is None or d in domains]
+    chosen = [d for d in content.domains if domains is None or d in domains]
 
     def load(domain: str, view: str, camera: Camera) -> np.ndarray:
         path = folder.file(f"{domain}/{view}.{'exr' if domain == 'depth' else 'png'}")
@@ -79,12 +79,12 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
 
     if len({(camera.height, camera.width) for camera in cameras}) > 1:
         raise InputError(folder.file("cameras.json"), "has cameras of different sizes", "render all views at one size")
-    channels = sum(CHANNELS.get(domain, 1) for domain in wanted)
+    channels = sum(CHANNELS.get(domain, 1) for domain in chosen)
     size = (
         len(cameras)
         * cameras[0].height
         * cameras[0].width
-        * (channels + 1 + _PASSING * max((CHANNELS.get(domain, 1) for domain in wanted), default=1))
+        * (channels + 1 + _PASSING * max((CHANNELS.get(domain, 1) for domain in chosen), default=1))
         * 4
     )
     require_memory(
@@ -95,7 +95,7 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
     )
     mask = np.stack([load("mask", c.name, c) for c in cameras]).astype(np.float32)
     images: dict[str, np.ndarray] = {}
-    for domain in wanted:
+    for domain in chosen:
         stack = np.stack([load(domain, c.name, c) for c in cameras]).astype(np.float32)
         if domain == "normal":
             stack = decode_normal(stack)
@@ -103,15 +103,15 @@ def read_views(folder: Folder, domains: tuple[str, ...] | None = None) -> Views:
             stack = linear_from_srgb(stack).astype(np.float32)
         inside = mask > 0
         images[domain] = np.where(inside[..., None] if stack.ndim == 4 else inside, stack, 0).astype(np.float32)
-    light = read_record(folder.file("light.json")) if content.light else None
+    light = read_light(folder.file("light.json")) if content.light else None
     return Views(cameras, images, mask, light)
 
 
 def read_picture(folder: Folder, cameras: list[Camera]) -> tuple[np.ndarray, Camera] | None:
-    """Read the picture that the views were made of, and the camera that it looks through.
+    """Read the picture that the views of a folder were made of, and the camera of the view that it shows.
 
-    The picture (h, w, 4) has linear color and straight alpha. None where the folder holds none. Raises InputError for
-    one whose size is not a whole multiple of its view's.
+    The picture (h, w, 4) has linear color and straight alpha. Returns None where the folder has no such picture. Raises
+    InputError where its size is not a whole multiple of the size of that view.
     """
     from gdtool.images.color import linear_from_srgb, unit_range
     from gdtool.images.io import read_image
@@ -161,23 +161,23 @@ def write_views(out: Output, views: Views, *, source_from_world: np.ndarray | No
             if domain == "depth":
                 write_exr(out.path(f"depth/{name}.exr"), image.astype(np.float32))
                 near, far = views.cameras[k].near, views.cameras[k].far
-                shown = np.where(mask > 0, np.clip((far - image) / (far - near), 0, 1), 1)
+                thumbnail = np.where(mask > 0, np.clip((far - image) / (far - near), 0, 1), 1)
             elif domain == "normal":
                 encoded = np.where(mask[..., None] > 0, encode_normal(image), 0.5)
                 write_png(out.path(f"normal/{name}.png"), encoded, bits=16)
-                shown = np.where(mask[..., None] > 0, encoded, 1)
+                thumbnail = np.where(mask[..., None] > 0, encoded, 1)
             elif domain in ("color", "albedo", "closed_form"):
                 encoded = srgb_from_linear(np.clip(image, 0, 1))
                 rgba = np.concatenate([encoded, mask[..., None]], -1) if domain == "color" else encoded
                 write_png(out.path(f"{domain}/{name}.png"), rgba)
-                shown = encoded * mask[..., None] + 1 - mask[..., None]
+                thumbnail = encoded * mask[..., None] + 1 - mask[..., None]
             else:
                 write_png(out.path(f"{domain}/{name}.png"), np.clip(image, 0, 1))
-                shown = image * mask + 1 - mask
-            row.append(np.asarray(shown, np.float32))
+                thumbnail = image * mask + 1 - mask
+            row.append(np.asarray(thumbnail, np.float32))
         sheet.append(row)
     if views.light is not None:
-        write_record(out.path("light.json"), views.light)
+        write_light(out.path("light.json"), views.light)
     if views.images:
         picture = contact_sheet(sheet, labels_top=list(views.images), labels_left=list(views.names))
         write_png(out.path("contact_sheet.png"), picture)

@@ -115,7 +115,7 @@ def spatial_order(points: np.ndarray) -> np.ndarray:
 
 
 def closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return for each of points (n, 3) the closest point (n, 3) on the triangle of its own, corners (n, 3, 3).
+    """Return the closest point (n, 3) to each of points (n, 3) on one triangle each, with corners (n, 3, 3).
 
     Does what trimesh.triangles.closest_point does, whose import takes 0.3 s.
     """
@@ -135,7 +135,7 @@ def closest_on_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 class SplitFaces(NamedTuple):
-    """A mesh whose long faces were split, and face_idx (g,): the face of the original that each face is part of."""
+    """Hold a mesh whose long faces were split, and face_idx (g,): the original face that each face is part of."""
 
     mesh: TriMesh
     face_idx: np.ndarray
@@ -144,10 +144,12 @@ class SplitFaces(NamedTuple):
 def split_long_faces(mesh: TriMesh, longest: float, max_faces: int) -> SplitFaces:
     """Split faces until no edge is longer than `longest`, or until one more round would exceed max_faces.
 
-    Each round cuts the longest edges in the middle; neighbours do not share the new vertices. A search tree finds
-    closest points on the result sooner, because the boxes of long faces are mostly empty. Does what
-    trimesh.remesh.subdivide_to_size does, with a limit, which a mesh of many long faces needs, and without an import
-    of 0.3 s.
+    Each round cuts the longest edges in the middle. Neighbours do not share the new vertices, so the result is not
+    watertight. A search tree finds closest points on the result sooner, because the boxes of long faces are mostly
+    empty.
+
+    Does what trimesh.remesh.subdivide_to_size does, without an import of 0.3 s. The limit keeps a mesh of many long
+    faces from filling the memory.
     """
     whole, corners = np.arange(len(mesh.faces)), mesh.vertices[mesh.faces]
     done: list[tuple[np.ndarray, np.ndarray]] = []
@@ -171,7 +173,7 @@ def split_long_faces(mesh: TriMesh, longest: float, max_faces: int) -> SplitFace
 def closest_points(points: np.ndarray, mesh: TriMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return for points (n, 3) the distance (n,) to the surface, face_idx (n,) int32 and the closest point (n, 3).
 
-    Vertices that no face uses are no surface. Faces without area count as the segment or point that they are. Raises
+    Vertices that no face uses are ignored. Faces without area count as the segment or point that they are. Raises
     ValueError for a mesh without faces.
     """
     if not len(mesh.faces):

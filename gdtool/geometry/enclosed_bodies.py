@@ -17,7 +17,7 @@ _MAX_OUTER = 200  # bodies tested for contents, the largest boxes first: limits 
 
 
 class EnclosedBodies(NamedTuple):
-    """How many closed bodies lie inside another closed body, and the share of all faces that are theirs."""
+    """Hold how many closed bodies lie inside another closed body, and the share of all faces that belong to them."""
 
     bodies: int
     face_share: float
@@ -26,9 +26,9 @@ class EnclosedBodies(NamedTuple):
 def enclosed_bodies(mesh: TriMesh, welded: bool = True) -> EnclosedBodies:
     """Count closed bodies inside other closed bodies.
 
-    Bodies are connected by edges; open ones neither enclose nor count. A body counts where _SAMPLES of its vertices
-    have a winding number of about 1 or -1 in one other body. welded: False where vertices at one position have several
-    indices, as along seams of texture coordinates.
+    A body is a set of faces connected by edges. Open bodies neither enclose nor count. A closed body counts where a few
+    of its vertices (_SAMPLES) all have a winding number of about 1 or -1 in one other body. welded: False where
+    vertices at one position have several indices, as along seams of texture coordinates.
     """
     vertices, faces = mesh.vertices, mesh.faces
     if not welded:
@@ -63,7 +63,7 @@ def enclosed_bodies_warning(mesh: TriMesh, welded: bool = True) -> str | None:
         return None
     bodies = "1 closed body lies" if count == 1 else f"{count} closed bodies lie"
     return (
-        f"{bodies} inside another, with {share:.1%} of the faces, seen from nowhere outside; remove what is not wanted"
+        f"{bodies} inside another, with {share:.1%} of the faces, not visible from outside; remove what is not wanted"
     )
 
 
@@ -77,7 +77,10 @@ def _bounding_boxes(mesh: TriMesh, body: np.ndarray, count: int) -> tuple[np.nda
 
 
 def _closed_bodies(faces: np.ndarray, body: np.ndarray, count: int) -> np.ndarray:
-    """(count,) bool: bodies each of whose edges has an even number of faces."""
+    """Return (count,) bool: which bodies are closed, with an even number of faces at each edge.
+
+    faces (f, 3). body (f,): the body of each face.
+    """
     closed = np.ones(count, bool)
     if not has_even_edge_counts(faces):
         edges = edges_of(faces)

@@ -14,7 +14,7 @@ from gdtool.geometry.meshes import TriMesh
 
 @dataclass(frozen=True)
 class Grid:
-    """Sample points at origin + step * (i, j, k), i, j, k below shape.
+    """Define a regular grid of sample points: origin + step * (i, j, k), with i, j, k below shape.
 
     origin (3,) and step in world units; shape: the number of points along each axis.
     """
@@ -119,7 +119,7 @@ def signed_volume(mesh: TriMesh) -> float:
 
 
 def components(faces: np.ndarray, vertex_count: int) -> np.ndarray:
-    """Return the connected piece (f,) of each face, from 0; faces that share a vertex are of one piece."""
+    """Return the connected piece (f,) of each face, from 0; faces that share a vertex belong to one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class TriMesh:
-    """A triangle mesh: vertices (v, 3) floating point, faces (f, 3) integers, counter-clockwise seen from outside."""
+    """Hold a triangle mesh: vertices (v, 3) floating point, faces (f, 3) integers.
+
+    Faces are counter-clockwise seen from outside.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -48,7 +51,9 @@ class TriMesh:
 
 
 class Triangulation(NamedTuple):
-    """Triangles that quads are cut into: faces (t, 3) int32, and face_idx (t,) int32, the quad each comes from."""
+    """Hold the triangles that faces are cut into: faces (t, 3) int32, and face_idx (t,) int32, the face each comes
+    from.
+    """
 
     faces: np.ndarray
     face_idx: np.ndarray
@@ -56,11 +61,11 @@ class Triangulation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class QuadMesh:
-    """A mesh of quads, and triangles where faces[:, 3] is -1; counter-clockwise seen from outside.
+    """Hold a mesh of quads, and triangles where faces[:, 3] is -1; counter-clockwise seen from outside.
 
     vertices (v, 3) floating point, faces (f, 4) integers. uv (c, 2) in [0, 1], (0, 0) at the image's top left, and
     face_uvs (f, 4) indices into uv, -1 for a triangle's fourth corner; both None without texture coordinates. Files
-    hold float64 and int32, in the normalised frame.
+    store float64 and int32, in the normalised frame.
     """
 
     vertices: np.ndarray

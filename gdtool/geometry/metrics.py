@@ -32,11 +32,11 @@ SYNC_FOV = float(np.degrees(2 * np.arctan(32 / 35 / 2)))
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """How surface_protocol() measures.
+    """Choose how surface_protocol() measures.
 
-    cameras: those whose visible part is measured as well. samples: points on each surface. seed: of their random
-    positions. threshold: distance for precision and recall, as a share of the truth's largest extent. cells: cells
-    along each side of the cube for the intersection over union.
+    cameras: the part of a surface that these see is measured as well. samples: number of points on each surface. seed:
+    of their random positions. threshold: distance for precision and recall, as a share of the truth's largest extent.
+    cells: number of cells along each side of the cube for the intersection over union.
     """
 
     cameras: Sequence[Camera] = ()
@@ -52,10 +52,11 @@ def weld_faces(mesh: TriMesh) -> np.ndarray:
 
 
 def is_closed(mesh: TriMesh) -> bool:
-    """Whether the surface has no boundary: after welding, faces traverse each edge as often one way as the other.
+    """Tell whether a surface has no boundary: after welding, its faces traverse each edge equally often in both
+    directions.
 
-    This, and not two faces for each edge, is what makes the winding number an integer everywhere. Bodies that touch in
-    an edge are closed; a body of which one part is inside out is not.
+    This rule, and not two faces for each edge, makes the winding number an integer everywhere. Bodies that touch along
+    an edge are closed. A body of which one part is inside out is not.
     """
     if not len(mesh.faces):
         return False
@@ -70,10 +71,10 @@ def is_closed(mesh: TriMesh) -> bool:
 def visible(
     points: np.ndarray, normals: np.ndarray, caster: RayCaster, cameras: Sequence[Camera], tolerance: float
 ) -> np.ndarray:
-    """(n,) bool: whether points (n, 3) on the caster's mesh are visible in any camera's picture.
+    """Return (n,) bool: whether points (n, 3) on the caster's mesh are visible in any camera's picture.
 
-    normals (n, 3): faces are visible from both sides, but not edge-on. tolerance: how far behind the first hit a point
-    may lie.
+    normals (n, 3): faces are visible from both sides, but not edge-on. tolerance: how far a point may lie behind the
+    first hit of its ray, in the unit of the points.
     """
     out = np.zeros(len(points), bool)
     for camera in cameras:
@@ -93,12 +94,14 @@ def visible(
 def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | None = None) -> dict[str, float]:
     """Run the "surface" protocol: distances from area-weighted samples of each surface to the other *surface*.
 
-    Unit: the truth's largest extent. distance is the mean of accuracy (result to truth) and completeness (truth to
-    result); precision and recall are the shares within the threshold, f_score their harmonic mean. normal_degrees is
-    the mean angle between a sample's normal and that of the closest point, orientation ignored (0 to 90);
-    flipped_share is how many of these face the other way. iou is computed on cells^3 cells of the truth's box padded by
-    a tenth, and only where the truth is closed. With cameras, the figures of what they see follow as seen_*: from the
-    part of the truth that they see to the result, and from the part of the result that they would see to the truth.
+    Distances are in units of the truth's largest extent. distance is the mean of accuracy (result to truth) and
+    completeness (truth to result). precision and recall are the shares of samples within the threshold, f_score their
+    harmonic mean. normal_degrees is the mean angle between a sample's normal and that of the closest point, orientation
+    ignored (0 to 90); flipped_share is the share of these pairs that face opposite ways. iou is computed on cells^3
+    cells of the truth's box padded by a tenth, and only where the truth is closed.
+
+    With cameras the same figures follow as seen_* for the visible parts. Completeness is then measured from the part of
+    the truth that the cameras see, accuracy from the part of the result that they would see.
     """
     options = options or SurfaceOptions()
     extent = float(np.ptp(truth.vertices[np.unique(truth.faces)], axis=0).max())
@@ -112,7 +115,7 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
     cosine = (normals[face_idx] * true_normals[near_true_idx]).sum(1)
     true_cosine = (true_normals[true_idx] * normals[near_idx]).sum(1)
 
-    out = _both_ways(accuracy, completeness, cosine, true_cosine, options.threshold)
+    out = _two_way_figures(accuracy, completeness, cosine, true_cosine, options.threshold)
     out["hausdorff"] = float(max(accuracy.max(), completeness.max()))
     if is_closed(truth):
         out["iou"] = volume_iou(mesh, truth, options.cells)
@@ -121,7 +124,7 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
         true_part = _visible_in_unit(true_points, true_normals[true_idx], truth, options.cameras, extent)
         out["seen_share"] = float(true_part.mean())
         if part.any() and true_part.any():
-            of_visible = _both_ways(
+            of_visible = _two_way_figures(
                 accuracy[part], completeness[true_part], cosine[part], true_cosine[true_part], options.threshold
             )
             out |= {f"seen_{name}": value for name, value in of_visible.items()}
@@ -131,12 +134,15 @@ def surface_protocol(mesh: TriMesh, truth: TriMesh, options: SurfaceOptions | No
 def _visible_in_unit(
     points: np.ndarray, normals: np.ndarray, mesh: TriMesh, cameras: Sequence[Camera], extent: float
 ) -> np.ndarray:
-    """Do what visible() does, for points and a mesh in units of `extent`; the cameras are in the caller's units."""
+    """Return (n,) bool: whether points (n, 3) of a mesh are visible in any camera's picture.
+
+    points, mesh: in units of `extent`, which is in the cameras' unit. normals (n, 3): of the points, unit.
+    """
     caster = RayCaster(TriMesh(mesh.vertices * extent, mesh.faces))
     return visible(points * extent, normals, caster, cameras, VISIBLE_TOLERANCE * extent)
 
 
-def _both_ways(
+def _two_way_figures(
     accuracy: np.ndarray, completeness: np.ndarray, cosine: np.ndarray, true_cosine: np.ndarray, threshold: float
 ) -> dict[str, float]:
     """Return the figures of distances and normals' cosines, from result to truth and from truth to result."""
@@ -158,7 +164,10 @@ def _both_ways(
 
 
 def inside(points: np.ndarray, mesh: TriMesh) -> np.ndarray:
-    """(n,) bool: whether points (n, 3) lie inside, by winding number; the whole mesh may be inside out."""
+    """Return (n,) bool: whether points (n, 3) lie inside a mesh, by winding number.
+
+    The whole mesh may be inside out.
+    """
     return np.abs(winding_number(points, mesh)) > 0.5
 
 
@@ -173,17 +182,21 @@ def volume_iou(mesh: TriMesh, truth: TriMesh, cells: int = IOU_CELLS, pad: float
 
 
 def _grid_iou(mesh: TriMesh, truth: TriMesh, center: np.ndarray, side: float, cells: int) -> float:
-    """Do what volume_iou() does, in the cube with this centre (3,) and side."""
+    """Compute the intersection over union of two volumes at the centres of cells^3 cells of a cube.
+
+    center (3,) and side of the cube, in the unit of the meshes.
+    """
     a, b = (occupancy(body, center, side, cells) for body in (mesh, truth))
     either = int((a | b).sum())
     return int((a & b).sum()) / either if either else 0.0
 
 
 def occupancy(mesh: TriMesh, center: np.ndarray, side: float, cells: int) -> np.ndarray:
-    """(cells, cells, cells) bool: which cell centres of a cube lie inside the mesh.
+    """Return (cells, cells, cells) bool: which cell centres of a cube lie inside the mesh.
 
-    A block of cells that a closed surface does not pass through is tested once, because the winding number is constant
-    there. Around an open surface it is not, so every cell is tested.
+    center (3,) and side of the cube, in the unit of the mesh. A block of cells that a closed surface does not pass
+    through is tested once, because the winding number is constant there. Around an open surface it is not, so every
+    cell is tested.
     """
     block = BLOCK if cells % BLOCK == 0 and is_closed(mesh) else 1
     centers = _cell_centers(cells // block, side) + center
@@ -259,7 +272,7 @@ def depth_cloud(mesh: TriMesh) -> np.ndarray:
     for camera in sync_cameras():
         origins, directions = (array.reshape(-1, 3) for array in camera_rays(camera))
         hits = caster.first_hit(origins, directions)
-        parts.append(origins[hits.found] + hits.distance[hits.found, None] * directions[hits.found])
+        parts.append(origins[hits.is_hit] + hits.distance[hits.is_hit, None] * directions[hits.is_hit])
     return voxel_downsample(np.concatenate(parts), SYNC_VOXEL)
 
 
@@ -310,7 +323,7 @@ def align(points: np.ndarray, others: np.ndarray, steps: int = 60, count: int = 
 def similarity(points: np.ndarray, others: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the (4, 4) rotation, uniform scale and translation that best map points (n, 3) to others (n, 3).
 
-    Weighted least squares after Umeyama 1991; weights (n,).
+    It minimises the squared distances, weighted by weights (n,), after Umeyama 1991.
     """
     weights = weights / weights.sum()
     center, other_center = weights @ points, weights @ others

@@ -12,9 +12,9 @@ from gdtool.geometry.topology import Edges, corner_fans, edges_of
 def separate_sheets(mesh: TriMesh, rounds: int = 3) -> TriMesh:
     """Give each sheet of a closed mesh its own copy of the edges where several sheets meet.
 
-    Faces on both sides of one wedge of the inside stay together; a sheet that comes off becomes a piece. Edges with an
-    odd number of faces, or with more faces in one direction than in the other, are left. rounds: how often it may run
-    again on what it could not separate at once.
+    Faces on both sides of one wedge of the inside stay connected. A sheet that is connected nowhere else becomes a
+    piece of its own. Edges with an odd number of faces, or with more faces in one direction than in the other, are
+    left. rounds: how often the pass is repeated on edges that it could not separate at once.
     """
     vertices, faces = mesh.vertices, mesh.faces
     edges = edges_of(faces)
@@ -77,7 +77,7 @@ def _wedge_pairs(mesh: TriMesh, edges: Edges) -> np.ndarray:
 def _split_pairs(mesh: TriMesh, near: np.ndarray, edges: Edges, pairs: np.ndarray) -> TriMesh:
     """Add a vertex in the middle of each pair of half edges (k, 2), and cut its two triangles there.
 
-    near (n,): the faces of the mesh that `edges` is of.
+    edges: of the faces `near` (n,) of the mesh only; pairs index into its half edges.
     """
     vertices, faces = mesh.vertices, mesh.faces.copy()
     touched: set[int] = set()

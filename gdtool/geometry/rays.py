@@ -24,7 +24,7 @@ _MAX_PAIRS = 20_000_000  # faces times vertices, above which comparing with the 
 
 @dataclass(frozen=True)
 class Hits:
-    """Nearest hits of n rays.
+    """Hold the nearest hits of n rays.
 
     face_idx (n,) int32, -1 for a miss; distance (n,) in units of the direction's length, inf for a miss; barycentric
     (n, 3) weights of the face's corners, 0 for a miss, component by component in memory.
@@ -35,7 +35,7 @@ class Hits:
     barycentric: np.ndarray
 
     @property
-    def found(self) -> np.ndarray:
+    def is_hit(self) -> np.ndarray:
         """(n,) bool: which rays hit."""
         return self.face_idx >= 0
 
@@ -52,9 +52,10 @@ def intersect_planes(origins: np.ndarray, directions: np.ndarray, corners: np.nd
 
 
 def _intersect(origins: np.ndarray, directions: np.ndarray, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Do what intersect_planes() does, for packed (9, n): a corner and two edge vectors of each triangle.
+    """Return distance (n,) and barycentric weights (n, 3) where rays meet the planes of triangles, as
+    intersect_planes().
 
-    The layout keeps each component contiguous.
+    packed (9, n): a corner and two edge vectors of each triangle, each component contiguous.
     """
     o, d, a, e1, e2 = origins.T, directions.T, packed[:3], packed[3:6], packed[6:]
     p = cross(d, e2)
@@ -79,7 +80,7 @@ def _intersect(origins: np.ndarray, directions: np.ndarray, packed: np.ndarray) 
 
 
 class RayCaster:
-    """An Embree scene of one mesh.
+    """Cast rays at one mesh with Embree, and refine the hits in double precision.
 
     The mesh is moved into a unit box before it is rounded to Embree's single precision, so that neither a far origin
     nor an odd unit costs accuracy; all arguments and results are in the caller's frame. Raises MemoryError where a
@@ -158,7 +159,10 @@ class RayCaster:
     def occluded(
         self, origins: np.ndarray, directions: np.ndarray, max_distance: float | np.ndarray = np.inf
     ) -> np.ndarray:
-        """(n,) bool: whether anything lies on each ray before max_distance (in units of the direction's length)."""
+        """Return (n,) bool: whether anything lies on each ray before max_distance.
+
+        origins, directions (n, 3). max_distance: one number or (n,), in units of the direction's length.
+        """
         limits = None
         if np.ndim(max_distance) or np.isfinite(max_distance):
             limits = np.minimum(
@@ -168,11 +172,12 @@ class RayCaster:
 
 
 def is_convex(mesh: TriMesh, tolerance: float = 1e-6) -> bool:
-    """Whether all faces lie on the convex hull of their corners, so that none hides another from outside.
+    """Tell whether all faces lie on the convex hull of their corners, so that none hides another from outside.
 
-    Each face's plane must have all vertices on one side, within `tolerance` of the longest side. A few faces are
-    tested first, because nearly every mesh that is not convex fails there. A mesh of many faces is compared with the
-    hull (Qhull): no centre of a face may lie deeper in it than the tolerance.
+    Each face's plane must have all vertices on one side, within `tolerance` of the longest side. A few faces are tested
+    first, because nearly every mesh that is not convex fails there. A mesh of many faces is compared with the hull
+    (Qhull): no centre of a face may lie deeper in it than the tolerance. Meshes of more than MAX_CONVEX vertices are
+    not tested, and count as not convex.
     """
     from gdtool.geometry.normals import face_normals
 
@@ -182,19 +187,22 @@ def is_convex(mesh: TriMesh, tolerance: float = 1e-6) -> bool:
     points = mesh.vertices[used]
     extent = float((points.max(0) - points.min(0)).max())
     normals, areas = face_normals(mesh)
-    solid = np.flatnonzero(areas > 1e-12 * extent**2)
-    few = solid[:: max(1, len(solid) // 64)]
-    if not _on_one_side(mesh, normals, few, points, tolerance * extent):
+    with_area = np.flatnonzero(areas > 1e-12 * extent**2)
+    sampled = with_area[:: max(1, len(with_area) // 64)]
+    if not _on_one_side(mesh, normals, sampled, points, tolerance * extent):
         return False
-    if len(solid) * len(points) > _MAX_PAIRS:
-        depth = _depth_in_hull(TriMesh(mesh.vertices, mesh.faces[solid]), points)
+    if len(with_area) * len(points) > _MAX_PAIRS:
+        depth = _depth_in_hull(TriMesh(mesh.vertices, mesh.faces[with_area]), points)
         if depth is not None:
             return depth <= tolerance * extent
-    return _on_one_side(mesh, normals, solid, points, tolerance * extent)
+    return _on_one_side(mesh, normals, with_area, points, tolerance * extent)
 
 
 def _on_one_side(mesh: TriMesh, normals: np.ndarray, face_idx: np.ndarray, points: np.ndarray, slack: float) -> bool:
-    """Whether the plane of each of some faces has all points (n, 3) on one side, but for a distance of `slack`."""
+    """Tell whether the plane of each chosen face has all points (n, 3) on one side, within a distance of `slack`.
+
+    normals (f, 3) of all faces; face_idx (k,): the faces to test.
+    """
     for start in range(0, len(face_idx), 512):
         part = face_idx[start : start + 512]
         offset = np.einsum("ij,ij->i", normals[part], mesh.vertices[mesh.faces[part, 0]])

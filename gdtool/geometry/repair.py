@@ -31,9 +31,9 @@ _MAX_SMALL_SHARE = 0.02  # of the faces: pieces beyond the expected number that 
 
 
 class CleanMesh(NamedTuple):
-    """A repaired mesh.
+    """Hold a repaired mesh.
 
-    repairs: how many of each kind were made, by name; is_closed: whether it is watertight.
+    repairs: how many of each kind were made, by name; is_closed: whether the mesh is watertight.
     """
 
     mesh: TriMesh
@@ -94,9 +94,9 @@ def clean(mesh: TriMesh, subject: object = "mesh") -> CleanMesh:
         # A closed mesh keeps its indices: welding could join sheets that only touch.
         welded = _weld(TriMesh(vertices, faces), extent * WELD_SHARE)
         _note(repairs, "welded_vertices", _used_count(faces, len(vertices)) - _used_count(welded, len(vertices)))
-        kept = np.flatnonzero(~has_repeated_corner(welded))
-        _note(repairs, "degenerate_faces", len(welded) - len(kept) + repairs.get("degenerate_faces", 0))
-        faces, normals, areas = (array.take(kept, 0) for array in (welded, normals, areas))
+        kept_idx = np.flatnonzero(~has_repeated_corner(welded))
+        _note(repairs, "degenerate_faces", len(welded) - len(kept_idx) + repairs.get("degenerate_faces", 0))
+        faces, normals, areas = (array.take(kept_idx, 0) for array in (welded, normals, areas))
         one_fan = _closed_with_one_fan(faces, allow_doubled=False)
     if not one_fan:
         return _repair_structure(TriMesh(vertices, faces), extent, repairs, subject)
@@ -143,7 +143,7 @@ def _repair_structure(mesh: TriMesh, extent: float, repairs: dict[str, int | boo
 
 
 def _note(repairs: dict[str, int | bool], name: str, count: int) -> None:
-    """Enter a kind of repair where it was made."""
+    """Record the number of repairs of one kind in `repairs`, where there were any."""
     if count:
         repairs[name] = int(count)
 
@@ -156,9 +156,9 @@ def _used_count(faces: np.ndarray, count: int) -> int:
 
 
 def _closed_with_one_fan(faces: np.ndarray, allow_doubled: bool = True) -> bool | None:
-    """Whether the faces around each vertex of a closed mesh form one fan; None for an open mesh.
+    """Tell whether the faces around each vertex of a closed mesh form one fan; None for an open mesh.
 
-    allow_doubled: False makes two triangles with the same corners a reason to say no.
+    allow_doubled: with False the answer is also False where two triangles have the same corners.
     """
     if not has_even_edge_counts(faces) or (twins := twins_of(faces)) is None:
         return None
@@ -166,7 +166,7 @@ def _closed_with_one_fan(faces: np.ndarray, allow_doubled: bool = True) -> bool 
 
 
 def _has_doubled_triangle(twins: np.ndarray) -> bool:
-    """Whether two triangles have the same corners; twins (3 f,) as from twins_of()."""
+    """Tell whether two triangles have the same corners; twins (3 f,) as from twins_of()."""
     beside = twins.reshape(-1, 3) // 3
     return bool(((beside[:, 0] == beside[:, 1]) & (beside[:, 1] == beside[:, 2])).any())
 

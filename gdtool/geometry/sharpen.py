@@ -34,8 +34,8 @@ def dihedral_degrees(
     """Measure the angle between the normals of the two faces at each edge.
 
     Returns the edges (k, 2) with two faces, those faces (k, 2), and the angle (k,) in degrees, 0 beside faces without
-    area. thinnest: a triangle whose height is a smaller share of its longest side has no reliable normal, and takes
-    that of the face across this side. edges: the edges of the mesh, where they are known.
+    area. thinnest: a ratio of height to longest side. A triangle below it is a sliver without a reliable normal, and
+    takes the normal of the face across its longest side. edges: the edges of the mesh, where they are known.
     """
     vertices = mesh.vertices
     edges = edges or edges_of(mesh.faces)
@@ -54,10 +54,12 @@ def dihedral_degrees(
 
 
 def _across_slivers(length: np.ndarray, pairs: np.ndarray, area: np.ndarray, thinnest: float) -> np.ndarray:
-    """Return for each face (f,) the face whose normal stands for it: itself, or for a sliver the face across.
+    """Return for each face (f,) the face whose normal it takes: itself, or for a sliver the face across its longest
+    edge.
 
-    length (k,): of the edges between pairs (k, 2) of faces; area (f,). The face across is the one at the sliver's
-    longest edge, or the next one where that is a sliver too.
+    Where that face is a sliver too, the search goes on across its longest edge. length (k,): of the edges between pairs
+    (k, 2) of faces; area (f,) of the faces. thinnest: the ratio of height to longest side below which a face is a
+    sliver.
     """
     longest = np.zeros(len(area))
     for face in pairs.T:
@@ -73,9 +75,10 @@ def _across_slivers(length: np.ndarray, pairs: np.ndarray, area: np.ndarray, thi
 
 
 class RestoredCreases(NamedTuple):
-    """A mesh with restored creases.
+    """Hold a mesh with restored creases.
 
-    moved: how many vertices moved; largest_move: how far, at most; bevel_share: the share of vertices in bevels.
+    moved: how many vertices moved; largest_move: how far at most, in the mesh's unit; bevel_share: the share of
+    vertices in bevels.
     """
 
     mesh: TriMesh
@@ -91,10 +94,10 @@ def restore_creases(
 ) -> RestoredCreases:
     """Move the vertices of bevels to the creases that the bevels cut off.
 
-    The mesh is fine enough for a bevel to be one cell wide. Creases that are sharp already, smooth parts and rough
-    surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh manifold. crease_degrees: the
-    least angle of a crease. accept: called with vertex indices (n,) and positions (n, 3), returns (n,) bool, which of
-    the vertices may move there; None lets all move.
+    The mesh has to be so fine that a bevel is one cell wide, as marching cubes makes it. Creases that are sharp
+    already, smooth parts and rough surfaces stay as they are. The rims of a bevel are joined where that keeps the mesh
+    manifold. crease_degrees: the least angle of a crease. accept: called with vertex indices (n,) and positions (n, 3),
+    returns (n,) bool: which of the vertices may move there; None lets all move.
     """
     vertices = mesh.vertices
     moves = _crease_moves(mesh, crease_degrees, accept)
@@ -107,7 +110,7 @@ def restore_creases(
 
 
 class _CreaseMoves(NamedTuple):
-    """Which vertices (n,) move, and where to (n, 3); the median edge length, and the share of vertices in bevels."""
+    """Hold which vertices (n,) move and where (n, 3), the median edge length, and the share of vertices in bevels."""
 
     vertex_idx: np.ndarray
     position: np.ndarray
@@ -120,14 +123,14 @@ def _crease_moves(
     crease_degrees: float,
     accept: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
 ) -> _CreaseMoves:
-    """Find the moves of restore_creases(), whose arguments these are."""
+    """Find which vertices restore_creases() moves, and where to. The arguments are those of restore_creases()."""
     from scipy.spatial import cKDTree
 
     vertices, faces = mesh.vertices, mesh.faces
     maybe, used = _may_be_bent(mesh, crease_degrees / 2)
     # Only a face with both ends of a bent edge among its corners can have one: these are few in a fine mesh.
-    few = np.flatnonzero(marked_corner_counts(faces, maybe) > 1)
-    ends, pairs, angle = dihedral_degrees(TriMesh(vertices, faces.take(few, 0)))
+    candidates = np.flatnonzero(marked_corner_counts(faces, maybe) > 1)
+    ends, pairs, angle = dihedral_degrees(TriMesh(vertices, faces.take(candidates, 0)))
     bent = angle > crease_degrees / 2
     bevel = np.zeros(len(vertices), bool)
     bevel[ends[bent]] = True
@@ -142,7 +145,7 @@ def _crease_moves(
         near_bevel = np.flatnonzero(marked_corner_counts(faces, marked))
     side = np.zeros(len(faces), bool)
     side[near_bevel] = True
-    side[few[pairs[bent]]] = False  # these faces are the bevel
+    side[candidates[pairs[bent]]] = False  # these faces are the bevel
     side = faces.take(np.flatnonzero(side), 0)
     normals, area = face_normals(TriMesh(vertices, side))
     side, normals = side[area > 0], normals[area > 0]
@@ -182,11 +185,14 @@ def marked_corner_counts(faces: np.ndarray, marked: np.ndarray) -> np.ndarray:
 
 
 def _may_be_bent(mesh: TriMesh, degrees: float) -> tuple[np.ndarray, int]:
-    """Return (v,) bool, which vertices may have two faces whose normals differ by more than `degrees`.
+    """Return (v,) bool: a superset of the vertices where the normals of two faces differ by more than `degrees`.
 
-    It includes all that have. Also returns how many vertices have faces. Why this is enough: the mean of d unit normals
-    of which two are a chord c apart is no longer than sqrt(1 - c^2 / (2 d)). The variance is half the mean squared
-    distance of all pairs, and every other normal is at least c / 2 from one of the two.
+    Also returns how many vertices have faces.
+
+    A vertex is left out where the mean of its d unit normals is too long. If two of the normals are a chord c apart,
+    the mean is no longer than sqrt(1 - c^2 / (2 d)). The reason: 1 minus the squared length of the mean is the
+    variance, which is half the mean squared distance of all pairs of normals. The squared distances of every further
+    normal to those two sum to c^2 / 2 or more, so the variance is at least c^2 / (2 d).
     """
     vertices, faces = mesh.vertices, mesh.faces
     total, number = np.zeros((3, len(vertices))), np.zeros(len(vertices))
@@ -236,10 +242,11 @@ def _group_into_sides(
 def _meeting_point(
     points: np.ndarray, normals: np.ndarray, centroids: np.ndarray, cluster: np.ndarray, sides: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find where the planes of k faces near each of points (p, 3) meet: of the meeting points, the nearest.
+    """Find the point nearest to each of points (p, 3) where the planes of the k faces around it meet.
 
-    normals and centroids (3, k, p) of the faces; cluster (k, p) and sides (p,) as from _group_into_sides(). Returns the
-    meeting points (p, 3) and the rms distance (p,) to the planes.
+    normals and centroids (3, k, p) of the faces. cluster (k, p): the side that each face belongs to, and sides (p,):
+    the number of sides, both as from _group_into_sides(). Two sides meet in a line, three in a point. Returns the
+    meeting points (p, 3) and the rms distance (p,) from them to the planes.
     """
     weight = np.zeros(cluster.shape)
     for i in range(3):  # each side counts the same, however many of its faces are near
@@ -291,14 +298,14 @@ def collapse_bevels(mesh: TriMesh, moved: np.ndarray, longest: float) -> TriMesh
     collapser.collapse(np.searchsorted(local_idx, half))
     keep = np.ones(len(faces), bool)
     keep[near[~collapser.stays]] = False
-    kept = np.flatnonzero(keep)
-    out = faces.take(kept, 0)
-    out[np.searchsorted(kept, near[collapser.stays])] = local_idx[collapser.became[local[collapser.stays]]]
+    kept_faces = np.flatnonzero(keep)
+    out = faces.take(kept_faces, 0)
+    out[np.searchsorted(kept_faces, near[collapser.stays])] = local_idx[collapser.became[local[collapser.stays]]]
     return compact(TriMesh(vertices, out))
 
 
 class _Rims:
-    """The faces around bevels, while short edges are collapsed.
+    """Collapse short edges among the faces around bevels.
 
     stays (f,) bool: which faces are left; became (v,): the vertex that each vertex was merged into, or itself.
     """
@@ -310,7 +317,7 @@ class _Rims:
         self.stays, self.became = np.ones(len(mesh.faces), bool), np.arange(len(mesh.vertices))
 
     def collapse(self, edges: np.ndarray) -> None:
-        """Collapse edges (e, 2) in their order, each where it still can be.
+        """Collapse edges (e, 2) in their order, skipping each that can no longer be collapsed.
 
         Edges that share no face around them with an earlier one are collapsed together; the result is the same.
         """
@@ -335,21 +342,22 @@ class _Rims:
             self.became = self.became[self.became]
 
     def _collapse_independent(self, a: np.ndarray, b: np.ndarray, near: np.ndarray, corners: np.ndarray) -> None:
-        """Collapse edges from a (n,) to b (n,) where they can be; no two have a face around them in common.
+        """Collapse edges from vertices a (n,) to b (n,), except where that would break the mesh; their faces must not
+        overlap.
 
-        near (m,): all faces around them, with corners (3, m).
+        near (m,): all faces around the edges, with corners (3, m).
         """
         along = self._position[:, a] - self._position[:, b]
-        few = (a != b) & (dot(along, along) <= self._longest**2)
-        a, b = a[few], b[few]
+        short = (a != b) & (dot(along, along) <= self._longest**2)
+        a, b = a[short], b[short]
         if not len(a):
             return
-        of = np.full((2, len(self.became)), -1)
-        of[0, a] = of[1, b] = np.arange(len(a))
-        with_a, with_b = of[0][corners].max(0), of[1][corners].max(0)
+        edge_of = np.full((2, len(self.became)), -1)
+        edge_of[0, a] = edge_of[1, b] = np.arange(len(a))
+        with_a, with_b = edge_of[0][corners].max(0), edge_of[1][corners].max(0)
         shared = (with_a >= 0) & (with_a == with_b)
-        about = [np.unique((edge * of.shape[1] + corners)[:, edge >= 0]) for edge in (with_a, with_b)]
-        common = np.intersect1d(*about, assume_unique=True) // of.shape[1]
+        about = [np.unique((edge * edge_of.shape[1] + corners)[:, edge >= 0]) for edge in (with_a, with_b)]
+        common = np.intersect1d(*about, assume_unique=True) // edge_of.shape[1]
         can = (np.bincount(with_a[shared], minlength=len(a)) == 2) & (np.bincount(common, minlength=len(a)) == 4)
         done = np.zeros(len(a), bool)
         for edge, start, end in ((with_a, a, b), (with_b, b, a)):
@@ -359,8 +367,8 @@ class _Rims:
             area, was = _vector_area(self._position, after), self._area[:, face]
             good = can & ~done
             good[edge[(was[3] > self._tiny) & (dot(was, area) <= 0.1 * np.sqrt(was[3] * area[3]))]] = False
-            taken = good[edge]
-            self._corners[:, face[taken]], self._area[:, face[taken]] = after[:, taken], area[:, taken]
+            collapses = good[edge]
+            self._corners[:, face[collapses]], self._area[:, face[collapses]] = after[:, collapses], area[:, collapses]
             self.became[start[good]] = end[good]
             done |= good
         self.stays[near[shared][done[with_a[shared]]]] = False

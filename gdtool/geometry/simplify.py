@@ -45,16 +45,17 @@ QUICK_METHOD, TOPOLOGY_METHOD = "quadric collapse", "quadric collapse, topology 
 
 @dataclass(frozen=True)
 class SimplifyOptions:
-    """How to simplify a mesh.
+    """Choose how to simplify a mesh.
 
-    seconds: time limit of each child process. crease_degrees: first restore creases that turn by more from the bevels
-    of marching cubes, unless the result cannot be collapsed; 0 restores none. topology_first: start with MeshLab's
-    collapse, for meshes with more small parts than triangles to spare, where the quick one tears down large parts.
-    low_deviation: let the quick collapse stay nearer to the surface, at a fifth of the error, with less even triangles.
-    uniform: leave triangles of one size, off the surface by some hundredths of the input's edges (JITTER_EDGES).
-    measure_error: compute the error; a quick result that is as far off as its edges are long is then compared with
-    MeshLab's. is_closed: tells whether the input is watertight, where the caller can tell sooner than
-    topology.is_watertight(). while_waiting: called once while each child works.
+    seconds: time limit of each child process. crease_degrees: before the collapse, restore creases of at least this
+    angle from the bevels of marching cubes; 0 restores none. The creases are given up where the mesh then cannot be
+    collapsed. topology_first: start with MeshLab's collapse. It is for meshes with more small parts than triangles to
+    spare, of which the quick collapse destroys large parts. low_deviation: keep the quick collapse nearer to the
+    surface, at a fifth of the error, with less even triangles. uniform: make triangles of one size, which may lie off
+    the surface by some hundredths of the input's edge length (JITTER_EDGES). measure_error: compute the error; a quick
+    result that is as far off as its edges are long is then compared with MeshLab's. is_closed: tells whether the input
+    is watertight, where the caller can tell sooner than topology.is_watertight(). while_waiting: called once while each
+    child works.
     """
 
     seconds: float = 120.0
@@ -69,12 +70,12 @@ class SimplifyOptions:
 
 @dataclass(frozen=True)
 class SimplifyReport:
-    """What simplify() did.
+    """Report what simplify() did.
 
-    faces: triangles of the result. method: how it was made, "none" where the result is the input. creases: how many
-    vertices moved to restored creases. error: the largest distance of either mesh's vertices to the other surface (at
-    most about 20,000 vertices each), in the input's units; None where it was not measured. failed: what failed on the
-    way, None where nothing did.
+    faces: number of triangles of the result. method: how it was made, "none" where the result is the input. creases:
+    how many vertices moved to restored creases. error: the largest distance of either mesh's vertices to the other
+    surface (at most about 20,000 vertices each), in the input's units; None where it was not measured. failed: the
+    methods that failed before, with reasons; None where none did.
     """
 
     faces: int
@@ -85,7 +86,7 @@ class SimplifyReport:
 
 
 class Simplified(NamedTuple):
-    """A simplified mesh, attributes (v, ...) of its vertices where some were given, and a report."""
+    """Hold a simplified mesh, attributes (v, ...) of its vertices (None where none were passed), and a report."""
 
     mesh: TriMesh
     attributes: np.ndarray | None
@@ -93,25 +94,25 @@ class Simplified(NamedTuple):
 
 
 class ChildResult(NamedTuple):
-    """What a child made: the collapsed mesh, and how many vertices it moved to restored creases before."""
+    """Hold what a child process returns: the collapsed mesh, and how many vertices it moved to creases before."""
 
     mesh: TriMesh
     creases: int
 
 
 class CollapseCall(NamedTuple):
-    """One call of a collapse function below: function(mesh, *arguments)."""
+    """Hold a collapse function and its arguments, for the call function(mesh, *arguments)."""
 
     function: Callable[..., TriMesh]
     arguments: tuple
 
 
 def jitter_vertices(mesh: TriMesh) -> np.ndarray:
-    """Move vertices (v, 3) by noise of JITTER_EDGES times their faces' shortest edge, for triangles of one size.
+    """Return the vertices (v, 3) moved by random noise, so that the collapse leaves triangles of one size.
 
-    The collapse takes the edges that add the least error. With the noise each adds about the same error where the
-    surface is flat as where it curves less than the noise. Without it flat parts end as a few large triangles with
-    slivers around them.
+    The standard deviation is JITTER_EDGES times the shortest edge of the faces around a vertex. The collapse removes
+    the edges that add the least error first. Without noise an edge in a flat part adds none: flat parts end as a few
+    large triangles with slivers around them. With noise it adds about as much as one in a slightly curved part.
     """
     vertices, faces = mesh.vertices, mesh.faces
     position = np.ascontiguousarray(vertices, np.float32)
@@ -130,16 +131,20 @@ def jitter_vertices(mesh: TriMesh) -> np.ndarray:
 
 
 def break_coplanarity(mesh: TriMesh) -> np.ndarray:
-    """Move vertices that are coplanar but for rounding by up to _COPLANAR_JITTER_EDGES edge lengths; return all (v, 3).
+    """Return the vertices (v, 3), with those moved whose faces are coplanar but for rounding.
 
-    Returns the array itself where hardly any are. In an exact plane, the quadric of an edge has determinant zero, and
-    the collapse takes an end or the middle. Where rounding makes the determinant a little more than zero, it takes a
-    point far away, and then has to skip the edge: so curved parts are collapsed to their last triangles instead.
+    They move by up to _COPLANAR_JITTER_EDGES edge lengths. Where hardly any are coplanar, the array itself is returned.
+
+    Why: in an exact plane the quadric of an edge has determinant zero, and the collapse merges its ends at one of them
+    or in the middle. Rounding can make the determinant slightly more than zero. Then the optimal position is far away,
+    and the edge has to be skipped. Flat parts keep their triangles, and curved parts are collapsed to nearly nothing
+    instead.
     """
     vertices, faces = mesh.vertices, mesh.faces
     sampled = np.arange(len(vertices)) % max(len(vertices) // _SAMPLES, 1) == 0
-    around, few = topology.renumbered(faces[np.flatnonzero(marked_corner_counts(faces, sampled))], len(vertices))
-    sampled_coplanar = _nearly_coplanar(TriMesh(vertices[around], few))[sampled[around]]
+    near_sample = faces[np.flatnonzero(marked_corner_counts(faces, sampled))]
+    around_idx, sampled_faces = topology.renumbered(near_sample, len(vertices))
+    sampled_coplanar = _nearly_coplanar(TriMesh(vertices[around_idx], sampled_faces))[sampled[around_idx]]
     if sampled_coplanar.sum() / sampled.sum() < _MIN_COPLANAR_SHARE:
         return vertices
     coplanar = np.flatnonzero(_nearly_coplanar(mesh))
@@ -150,7 +155,7 @@ def break_coplanarity(mesh: TriMesh) -> np.ndarray:
 
 
 def _nearly_coplanar(mesh: TriMesh) -> np.ndarray:
-    """(v,) bool: vertices all of whose faces lie in one plane that rounding bends."""
+    """Return (v,) bool: vertices all of whose faces lie in one plane, except for rounding errors."""
     vertices, faces = mesh.vertices, mesh.faces
     single = TriMesh(vertices.astype(np.float32).astype(np.float64), faces)
     normals, corners = face_normals(single)[0].T, np.ascontiguousarray(faces.T, np.intp)
@@ -168,10 +173,10 @@ def _nearly_coplanar(mesh: TriMesh) -> np.ndarray:
 def collapse(mesh: TriMesh, target_faces: int, aggressiveness: float, unit: float = 1.0) -> TriMesh:
     """Collapse edges with fast-simplification, which is quick but does not keep the topology.
 
-    Each round takes all edges whose error is below a bound that rises from round to round, and starts at the same
-    number for a mesh of any size. unit: the length that counts as 1. With a large one the first rounds take edges in
-    any order, which leaves even triangles; with a small one they take the flattest first, which leaves a fifth of the
-    error.
+    Each round takes all edges whose error is below a bound. The bound rises from round to round, from the same number
+    for a mesh of any size. aggressiveness: how steeply it rises. unit: the length that counts as 1. With a large unit
+    the first rounds take edges in any order, which leaves even triangles. With a small unit they take the flattest
+    first, which leaves a fifth of the error.
     """
     fast_simplification = imported("fast_simplification")
     vertices, faces = fast_simplification.simplify(
@@ -212,7 +217,7 @@ def collapse_in_two_passes(mesh: TriMesh, target_faces: int) -> TriMesh:
 def cluster(mesh: TriMesh, target_faces: int) -> TriMesh:
     """Merge the vertices in each cell of a grid into their mean (Rossignac & Borrel 1993).
 
-    The fallback for open meshes: it always gives a result, but may join sheets.
+    This is the fallback for open meshes: it always gives a result, but may join sheets.
     """
     vertices, faces = mesh.vertices, mesh.faces
     low, extent = vertices.min(0), float(np.ptp(vertices, 0).max())
@@ -236,14 +241,14 @@ def median_edge(mesh: TriMesh) -> float:
 
 
 def _expected_edge(mesh: TriMesh, count: int) -> float:
-    """Return about how long the edges are of `count` equilateral triangles with the mesh's area."""
+    """Return the edge length of `count` equilateral triangles that together have the mesh's area."""
     faces = mesh.faces
     mean_area = face_normals(TriMesh(mesh.vertices, _sample_faces(faces)))[1].mean()
     return float((4 / 3**0.5 * mean_area * len(faces) / count) ** 0.5)
 
 
 def _sample_faces(faces: np.ndarray) -> np.ndarray:
-    """Return about _SAMPLES of the faces."""
+    """Return every n-th face, about _SAMPLES (20,000) of them."""
     return faces[:: max(len(faces) // _SAMPLES, 1)]
 
 
@@ -303,16 +308,16 @@ def simplify(
     return result
 
 
-def _comparable_error(made: Simplified) -> float:
+def _comparable_error(simplified: Simplified) -> float:
     """Return the error; infinite where nothing was simplified, or measured."""
-    report = made.report
+    report = simplified.report
     return np.inf if report.method == "none" or report.error is None else report.error
 
 
 class _Collapsed(NamedTuple):
-    """A usable mesh and the method that made it; creases: how many vertices moved to restored creases.
+    """Hold a usable mesh and the method that made it.
 
-    creases is None where no child reported it.
+    creases: how many vertices moved to restored creases; None where no child reported it.
     """
 
     mesh: TriMesh
@@ -321,7 +326,7 @@ class _Collapsed(NamedTuple):
 
 
 class _Simplification:
-    """One run of simplify(), in a unit box around the mesh."""
+    """Run simplify() once, in a unit box around the mesh."""
 
     def __init__(self, mesh: TriMesh, target_faces: int, options: SimplifyOptions):
         self.target_faces, self.options = target_faces, options
@@ -356,18 +361,18 @@ class _Simplification:
 
     def finish(self, collapsed: _Collapsed, attributes: np.ndarray | None) -> Simplified:
         """Drop small pieces that came off, interpolate attributes, measure the error and scale back."""
-        made = topology.compact(collapsed.mesh)
-        if topology.components(made.faces)[0] > 1 and self.is_closed:
-            made = repair.drop_small_pieces(made, self.pieces)
+        mesh = topology.compact(collapsed.mesh)
+        if topology.components(mesh.faces)[0] > 1 and self.is_closed:
+            mesh = repair.drop_small_pieces(mesh, self.pieces)
         report = SimplifyReport(
-            len(made.faces),
+            len(mesh.faces),
             collapsed.method,
             collapsed.creases,
-            deviation(self.mesh, made) * self.extent if self.options.measure_error else None,
+            deviation(self.mesh, mesh) * self.extent if self.options.measure_error else None,
             "; ".join(self.failed) or None,
         )
-        made_attributes = None if attributes is None else self._interpolate(attributes, made.vertices)
-        return Simplified(TriMesh(made.vertices * self.extent + self.centre, made.faces), made_attributes, report)
+        made_attributes = None if attributes is None else self._interpolate(attributes, mesh.vertices)
+        return Simplified(TriMesh(mesh.vertices * self.extent + self.centre, mesh.faces), made_attributes, report)
 
     def _interpolate(self, attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Return the input's attributes (v, ...) at its points closest to points (n, 3)."""
@@ -407,23 +412,23 @@ class _Simplification:
             if creases != 0 and not is_quick and not topology_first:
                 break  # folds hinder the collapse, of bevels that were moved where there is no crease
             try:
-                made, creases = self._run_child(call, crease_degrees)
+                mesh, creases = self._run_child(call, crease_degrees)
             except ChildFailed as failure:
                 self.failed.append(str(failure))
                 continue
-            made, is_sound = self._separated_if_torn(made)
-            if not is_sound and (self.is_closed or not _is_usable(made)):
+            mesh, is_sound = self._separated_if_torn(mesh)
+            if not is_sound and (self.is_closed or not _is_usable(mesh)):
                 self.failed.append("the result is not as closed as the input")
-            elif is_quick and not creases and len(made.faces) > self._most_finished_faces:
-                unfinished = made
-                self.failed.append(f"the quick collapse stopped at {len(made.faces)} triangles")
+            elif is_quick and not creases and len(mesh.faces) > self._most_finished_faces:
+                unfinished = mesh
+                self.failed.append(f"the quick collapse stopped at {len(mesh.faces)} triangles")
             else:
-                return _Collapsed(made, QUICK_METHOD if is_quick else TOPOLOGY_METHOD, creases), creases
+                return _Collapsed(mesh, QUICK_METHOD if is_quick else TOPOLOGY_METHOD, creases), creases
         return None if unfinished is None else _Collapsed(unfinished, QUICK_METHOD, creases), creases
 
     @property
     def _most_finished_faces(self) -> float:
-        """Triangles that a finished quick collapse leaves at most."""
+        """Most triangles that a quick collapse leaves where it finishes."""
         return _UNFINISHED_FACTOR * self.target_faces + _UNFINISHED_FACES
 
     def _run_child(self, call: CollapseCall, crease_degrees: float) -> ChildResult:
@@ -444,19 +449,19 @@ class _Simplification:
             options.while_waiting()
         return running.result()
 
-    def _separated_if_torn(self, made: TriMesh) -> tuple[TriMesh, bool]:
+    def _separated_if_torn(self, mesh: TriMesh) -> tuple[TriMesh, bool]:
         """Separate sheets where a closed mesh was torn; return the mesh, and whether it is closed and manifold."""
         # A closed result does for any input, so whether the input is closed is asked only for other results.
-        if _is_closed_manifold(made):
-            return made, True
-        if self.is_closed and _is_usable(made):
-            made = separate_sheets(made)  # most tears are two sheets that meet in an edge
-            return made, _is_closed_manifold(made)
-        return made, False
+        if _is_closed_manifold(mesh):
+            return mesh, True
+        if self.is_closed and _is_usable(mesh):
+            mesh = separate_sheets(mesh)  # most tears are two sheets that meet in an edge
+            return mesh, _is_closed_manifold(mesh)
+        return mesh, False
 
 
 def _is_usable(mesh: TriMesh) -> bool:
-    """Whether a native library's result has faces, indices in range and finite vertices."""
+    """Tell whether a native library's result has faces, indices in range and finite vertices."""
     faces = mesh.faces
     return bool(
         len(faces) and faces.min() >= 0 and faces.max() < len(mesh.vertices) and np.isfinite(mesh.vertices).all()
@@ -464,7 +469,7 @@ def _is_usable(mesh: TriMesh) -> bool:
 
 
 def _is_closed_manifold(mesh: TriMesh) -> bool:
-    """Whether a native library's result is usable, watertight and manifold."""
+    """Tell whether a native library's result is usable, watertight and manifold."""
     return _is_usable(mesh) and topology.is_watertight(mesh.faces) and topology.is_manifold(mesh.faces)
 
 

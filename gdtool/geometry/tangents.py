@@ -1,12 +1,18 @@
 """Compute tangent frames by the MikkTSpace algorithm (Mikkelsen 2008, "Simulation of Wrinkled Surfaces Revisited").
 
-This is its section 3.7. glTF viewers decode normal maps in this basis whether a file carries tangents or not, so a
-baker has to encode in it.
-The steps follow the algorithm's reference description: corners with identical position, normal and texture coordinate
-are one vertex; around each vertex, triangles that hang together by edges and turn the same way in texture space form a
-group; a group's tangent is the sum of its triangles' texture axes, each projected to the tangent plane, normalised and
-weighted by the corner's angle. Triangles without area in texture space take the frame of a neighbour at the vertex;
-unlike in the reference implementation they never join two groups that touch only through them.
+This is section 3.7 of that thesis. glTF viewers decode normal maps in this basis whether a file carries tangents or
+not, so a baker has to encode in it. The steps follow the algorithm's reference description:
+
+1. Corners with identical position, normal and texture coordinate are one vertex.
+
+2. Around each vertex, triangles that are connected by edges and have the same orientation in texture space form a
+group.
+
+3. A group's tangent is the sum of its triangles' texture axes, each projected to the tangent plane, normalised and
+weighted by the corner's angle.
+
+Triangles without area in texture space take the frame of a neighbour at the vertex. Unlike in the reference
+implementation they never join two groups that touch only through them.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ from gdtool.geometry.meshes import TriMesh
 
 
 def number_distinct_rows(*columns: np.ndarray) -> np.ndarray:
-    """Number the distinct rows of columns (n, k_i) side by side; return the number (n,) of each row.
+    """Return for each row (n,) of columns (n, k_i), side by side, the number of its distinct value, from 0.
 
     Rows are equal where they are as float32, bit by bit; 0 and -0 are equal.
     """
@@ -61,10 +67,10 @@ def edge_pairs(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _groups(vertex: np.ndarray, sign: np.ndarray) -> np.ndarray:
-    """Return the group (t, 3) of each corner.
+    """Return the group (t, 3) of each corner of triangles.
 
-    A group is corners of one vertex (vertex (t, 3)) whose triangles hang together by edges and have the same sign (t,),
-    which is not 0.
+    A group is the corners at one vertex (vertex (t, 3)) whose triangles are connected by edges and have the same sign
+    (t,), which is not 0.
     """
     count = len(vertex)
     first, second = edge_pairs(vertex)

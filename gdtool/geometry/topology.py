@@ -1,6 +1,6 @@
 """Answer questions about a mesh from its indices: edges, fans, pieces, whether it is closed and manifold.
 
-A fan is a set of faces around one vertex that hang together by edges. A half edge is one side of an edge: one row for
+A fan is a set of faces around one vertex that are connected by edges. A half edge is one side of an edge: one row for
 each corner of each face, directed from that corner to the face's next one.
 """
 
@@ -21,7 +21,7 @@ _MIN_COUNTING_KEYS = 4000  # with fewer keys, sorting is quicker than building a
 
 @dataclass(frozen=True)
 class Edges:
-    """Undirected edges of a mesh of triangles and quads, and its half edges.
+    """Hold the undirected edges of a mesh of triangles and quads, and its half edges.
 
     ends (e, 2): vertices, the lower first; count (e,): number of faces; turned (e,) bool: its two faces traverse it in
     the same direction. half_edge_idx (h,): the edge of each half edge; half_face (h,): its face; half_ends (h, 2): the
@@ -100,9 +100,9 @@ def twins_of(faces: np.ndarray) -> np.ndarray | None:
 
 
 def has_even_edge_counts(faces: np.ndarray) -> bool:
-    """Whether each edge of triangles (f, 3) belongs to an even number of them.
+    """Tell whether each edge of triangles (f, 3) belongs to an even number of them.
 
-    The exclusive or of a hash of every half edge's ends is 0 then; it is also 0 otherwise once in 2^64. A consistently
+    The exclusive or of a hash of every half edge's ends is 0 then. It is 0 by chance once in 2^64. A consistently
     oriented manifold is watertight where this holds, and this takes a tenth of the time of is_watertight().
     """
     total = np.uint64(0)
@@ -115,7 +115,7 @@ def has_even_edge_counts(faces: np.ndarray) -> bool:
 
 
 def is_watertight(faces: np.ndarray) -> bool:
-    """Whether every edge has exactly two faces, which traverse it in opposite directions."""
+    """Tell whether every edge has exactly two faces, which traverse it in opposite directions."""
     faces = np.asarray(faces)
     if not len(faces):
         return False
@@ -126,7 +126,7 @@ def is_watertight(faces: np.ndarray) -> bool:
 
 
 def is_manifold(faces: np.ndarray) -> bool:
-    """Whether no edge has more than two faces, and the faces around each vertex form one fan."""
+    """Tell whether no edge has more than two faces, and the faces around each vertex form one fan."""
     if not len(faces):
         return False
     if (twins := twins_of(faces)) is not None:
@@ -144,8 +144,8 @@ def corner_fans(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the fan (f, c) of each face corner, numbered over the whole mesh, and the number of fans at each vertex.
 
-    Faces on both sides of an edge of exactly two faces are of one fan. mates (k, 2): more pairs of half edges whose
-    faces are. edges: the edges of the faces, where they are known.
+    A fan is the faces around a vertex that are connected by edges of exactly two faces. mates (k, 2): further pairs of
+    half edges whose faces count as connected. edges: the edges of the faces, where they are known.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -183,7 +183,7 @@ def corner_fans(
 
 
 def components(faces: np.ndarray) -> tuple[int, np.ndarray]:
-    """Return the number of pieces and the piece (f,) of each face; faces that share an edge are of one piece."""
+    """Return the number of pieces and the piece (f,) of each face; faces that share an edge belong to one piece."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -217,9 +217,9 @@ def euler_number(faces: np.ndarray) -> int:
 
 
 def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
-    """Return how many handles a manifold of `pieces` pieces has, by Euler's formula; it may have boundary loops.
+    """Return how many handles a manifold of `pieces` connected pieces has; it may have boundary loops.
 
-    edges: the edges of the faces, where they are known.
+    The number follows from Euler's formula. edges: the edges of the faces, where they are known.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -237,7 +237,7 @@ def handles(faces: np.ndarray, pieces: int, edges: Edges | None = None) -> int:
 
 
 class Invariants(NamedTuple):
-    """Topological properties that simplification and remeshing must keep."""
+    """Hold the topological properties that simplification and remeshing must keep."""
 
     watertight: bool
     manifold: bool
@@ -256,7 +256,7 @@ def invariants(faces: np.ndarray) -> Invariants:
 
 
 def has_repeated_corner(faces: np.ndarray) -> np.ndarray:
-    """(f,) bool: which triangles (f, 3) have a vertex twice."""
+    """Return (f,) bool: which triangles (f, 3) have a vertex twice."""
     return (faces[:, 0] == faces[:, 1]) | (faces[:, 1] == faces[:, 2]) | (faces[:, 2] == faces[:, 0])
 
 
@@ -285,12 +285,16 @@ def renumbered(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _may_have_twins(faces: np.ndarray) -> bool:
-    """Whether these are triangles (f, 3) whose indices twins_of() can handle: not negative, and 32 bits wide."""
+    """Tell whether these are triangles (f, 3) whose indices twins_of() can handle: not negative, and 32 bits wide."""
     return len(faces) > 0 and faces.shape[1] == 3 and faces.min() >= 0 and max(faces.max(), 3 * len(faces)) < 2**31 - 1
 
 
 def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
-    """Do np.argsort(keys, kind="stable") for keys (n,) below width in linear time, as rows of a sparse matrix."""
+    """Return the stable sorting order (n,) of keys (n,) that are integers below width, in linear time.
+
+    The result is that of np.argsort(keys, kind="stable"). Many keys are sorted as the row indices of a sparse matrix,
+    few by numpy.
+    """
     from scipy.sparse import csr_array
 
     if len(keys) < _MIN_COUNTING_KEYS or width > 2**31 - 1 or len(keys) > 2**31 - 1:
@@ -300,7 +304,10 @@ def _counting_order(keys: np.ndarray, width: int) -> np.ndarray:
 
 
 def _components_of_twins(twins: np.ndarray) -> tuple[int, np.ndarray]:
-    """Do what components() does, for triangles that have twins (3 f,)."""
+    """Return the number of pieces and the piece (f,) of each triangle of a mesh with an opposite to each half edge.
+
+    twins (3 f,): these opposites, as from twins_of().
+    """
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
@@ -311,10 +318,11 @@ def _components_of_twins(twins: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def has_one_fan_per_vertex(faces: np.ndarray, twins: np.ndarray) -> bool:
-    """Whether the faces around each vertex of triangles (f, 3) that have twins (3 f,) form one fan.
+    """Tell whether the faces around each vertex of triangles (f, 3) form one fan.
 
-    Walks around all vertices at once, from one half edge that leaves the vertex to the next; with one fan the walk
-    meets all half edges that leave it before it comes back.
+    twins (3 f,): the opposite of each half edge, as from twins_of(). Walks around all vertices at once, from one half
+    edge that leaves the vertex to the next; with one fan the walk meets all half edges that leave it before it comes
+    back.
     """
     n, start = len(twins), faces.ravel()
     next_around = twins.take(np.arange(n, dtype=np.int32).reshape(-1, 3)[:, [2, 0, 1]].ravel())

@@ -30,7 +30,7 @@ def _snapped(uv: np.ndarray, faces: np.ndarray, size: int) -> tuple[np.ndarray, 
 
 
 def _chunks(cost: np.ndarray, limit: int) -> Iterator[slice]:
-    """Yield consecutive slices whose summed cost stays near limit; each holds at least one element."""
+    """Yield consecutive slices of cost (n,) whose sums stay near limit; each holds at least one element."""
     total = np.cumsum(cost)
     start = 0
     while start < len(cost):
@@ -165,11 +165,11 @@ def owner_count(uv: np.ndarray, faces: np.ndarray, size: int) -> np.ndarray:
 
 
 def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find texels that a chart's outline passes through and that are not next to any owned texel.
+    """Find the texels that a chart's outline passes through where no texel nearby has an owner.
 
-    Charts smaller than a texel, and the ends of slivers, cover no texel's centre; lookups there would read the
-    continuation of neighbouring charts. Texels next to owned ones are left to extend_owners(). owner (size, size) as
-    from owners_of(). Returns texel (n,), row-major indices, and the triangle (n,) there.
+    Charts smaller than a texel, and the ends of slivers, cover no texel's centre. Lookups there would read what lies
+    around neighbouring charts. Texels next to owned ones are left out, since extend_owners() fills them. owner (size,
+    size) as from owners_of(). Returns texel (n,), row-major indices, and the triangle (n,) there.
     """
     from gdtool.geometry.topology import edges_of
 
@@ -184,8 +184,8 @@ def between_centres(uv: np.ndarray, faces: np.ndarray, owner: np.ndarray) -> tup
     inside = ((at >= 0) & (at < size)).all(1)
     column, row = at[inside].astype(np.int64).T
     covered = np.pad(owner >= 0, 1).ravel()
-    place = (row + 1) * wide + column + 1
-    lone = ~np.any([covered[place + down + along] for down in (-wide, 0, wide) for along in (-1, 0, 1)], 0)
+    padded_idx = (row + 1) * wide + column + 1
+    lone = ~np.any([covered[padded_idx + down + along] for down in (-wide, 0, wide) for along in (-1, 0, 1)], 0)
     texel, first = np.unique((row * size + column)[lone], return_index=True)
     return texel, edges.half_face[rim[edge[inside][lone][first]]].astype(np.int32)
 
@@ -195,9 +195,10 @@ def extend_owners(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Extend the charts' triangles to texels just outside, which lookups at a chart's border read.
 
-    face_idx (size, size) as from rasterize_uv(). Returns texel (n,), row-major indices of up to `rings` texels around
-    all charts; owner (n,), the face of the nearest covered texel of a smaller ring; and barycentric (n, 3) float64,
-    linearly extrapolated and clamped to `farthest` outside [0, 1].
+    face_idx (size, size) as from rasterize_uv(). rings: how many texels wide the extension is; each ring is one texel
+    around the one before. Returns texel (n,), row-major indices of the texels around all charts; owner (n,), the face
+    of the nearest texel of the ring before; and barycentric (n, 3) float64, linearly extrapolated and clamped to
+    `farthest` outside [0, 1].
     """
     size = face_idx.shape[0]
     owner = np.pad(face_idx, 1, constant_values=-1)

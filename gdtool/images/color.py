@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-_AT_ONCE = 1 << 15  # numbers: what is computed of them stays in the cache
+_AT_ONCE = 1 << 15  # values at a time, so that intermediate arrays stay in the cache
 
 
 def srgb_from_linear(linear: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ def contact_sheet(
     Transparent pixels show white. Every cell has the size of the largest image. Labels stand above the columns and left
     of the rows, in a font of about a twelfth of that.
     """
-    cells = [[None if image is None else _shown(image) for image in row] for row in rows]
+    cells = [[None if image is None else _rgb_over_white(image) for image in row] for row in rows]
     filled = [image for row in cells for image in row if image is not None]
     if not filled:
         raise ValueError("a contact sheet needs an image")
@@ -50,7 +50,7 @@ def square_sheet(images: Sequence[np.ndarray]) -> np.ndarray:
     return contact_sheet([images[i : i + columns] for i in range(0, len(images), columns)])
 
 
-def _shown(image: np.ndarray) -> np.ndarray:
+def _rgb_over_white(image: np.ndarray) -> np.ndarray:
     """Convert an image to (h, w, 3) uint8, over white."""
     x = unit_range(image).astype(np.float32)
     x = x.reshape(*x.shape[:2], -1)

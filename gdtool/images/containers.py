@@ -22,8 +22,9 @@ PNG = b"\x89PNG\r\n\x1a\n"
 def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
     """Raise InputError for an empty, truncated or animated file.
 
-    Raises ResourceError for a huge PNG, or a file beyond MAX_FILE_BYTES. head: the first 64 bytes. file: open for
-    reading. Decoders print to stderr or fill with grey where a file ends early, so this looks first.
+    Raises ResourceError for a PNG of too many pixels, or a file of too many bytes (MAX_FILE_BYTES). head: the first 64
+    bytes. file: open for reading. Decoders print to stderr or fill with grey where a file ends early, so the structure
+    is checked first.
     """
     if not head:
         raise InputError(path, "is empty", COPY)
@@ -41,13 +42,14 @@ def check_container(path: Path, head: bytes, file: BinaryIO) -> None:
     elif head.startswith((b"GIF87a", b"GIF89a")):
         raise InputError(path, "is a GIF", "save one frame as PNG")
     elif head[:4] == b"RIFF" and head[8:12] == b"WEBP" and head[12:16] == b"VP8X" and head[20] & 2:
-        raise InputError(path, "is an animation", "save one frame as a still")
+        raise InputError(path, "is an animation", "save one frame as a still image")
 
 
 def suffix_of(head: bytes) -> str:
-    """Return the suffix that the first bytes of an image stand for.
+    """Return the suffix of the format that the first bytes of an image belong to.
 
-    OpenImageIO tries the suffix's format first, and only then says why that fails.
+    Under a name with this suffix OpenImageIO tries that format first. Only then does its message say why decoding
+    fails.
     """
     if head[:4] == b"RIFF":
         return ".webp" if head[8:12] == b"WEBP" else ""
@@ -94,7 +96,7 @@ def _check_png(path: Path, file: BinaryIO) -> None:
                 "scale it down",
             )
         if kind == b"acTL" and length >= 4 and struct.unpack(">I", body[:4])[0] > 1:
-            raise InputError(path, "is an animation", "save one frame as a still")
+            raise InputError(path, "is an animation", "save one frame as a still image")
         if kind == b"IEND":
             return
 

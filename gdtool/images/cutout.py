@@ -7,8 +7,11 @@ import numpy as np
 from gdtool.core.errors import InputError
 from gdtool.core.native import imported
 
-INSETS = (0.02, 0.06)  # widths of the frame that is taken for background, as shares of the picture
-AGREEMENT = 0.85  # least overlap of what the two frames give; docs/benchmarks/cutout.md says how well it tells
+INSETS = (0.02, 0.06)  # widths of the two frames that are taken for background, as shares of the picture
+# Least intersection over union of the two frames' results; docs/benchmarks/cutout.md measures how many wrong results it
+# refuses.
+AGREEMENT = 0.85
+MIN_SUBJECT, MAX_SUBJECT = 0.005, 0.8  # shares of the picture that a subject may cover; others are refused
 
 
 def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
@@ -19,7 +22,7 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
     raised with `cure`.
     """
     _, wide, agreement = both_frames(color)
-    if agreement < AGREEMENT or not 0.005 < float(wide.mean()) < 0.8:
+    if agreement < AGREEMENT or not MIN_SUBJECT < float(wide.mean()) < MAX_SUBJECT:
         raise InputError(
             subject, "has a background that is not plain, and its colors do not tell the subject from it", cure
         )
@@ -27,9 +30,9 @@ def cut_out(color: np.ndarray, subject: object, cure: str) -> np.ndarray:
 
 
 def both_frames(color: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Segment with the narrow and with the wide frame.
+    """Segment a picture by GrabCut twice: with a narrow and with a wide frame along its edge taken for background.
 
-    Returns both masks (h, w), boolean, and their intersection over union.
+    color (h, w, 3): sRGB in [0, 1]. Returns both foreground masks (h, w), boolean, and their intersection over union.
     """
     narrow, wide = (_grabcut(color, inset) for inset in INSETS)
     either = (narrow | wide).sum()

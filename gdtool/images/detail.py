@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 DARK = 0.02  # linear; added before a logarithm is taken, so that noise in dark parts does not count as detail
-BAND, WINDOW = (
-    3.0,
-    6.0,
-)  # pixels: standard deviations of the mean that detail is taken from, and of the window for gains
-FLOOR = 1e-3  # squared logarithms; with less detail than this the gain goes to 0
+# Standard deviations in pixels: of the mean that detail is the difference from, and of the window that gains are
+# measured in.
+BAND, WINDOW = 3.0, 6.0
+FLOOR = 1e-3  # squared logarithms of color; with less detail than this the gain goes to 0
 
 
 def masked_mean(values: np.ndarray, mask: np.ndarray, width: float) -> np.ndarray:
@@ -25,21 +24,24 @@ def masked_mean(values: np.ndarray, mask: np.ndarray, width: float) -> np.ndarra
     return sums / np.maximum(gaussian_filter(weight, width), 1e-6)[aligned]
 
 
-def detail_gain(one: np.ndarray, other: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Measure which share of one picture's detail the other has too, around each pixel; returns (h, w).
+def detail_gain(picture: np.ndarray, second: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Measure which share of a picture's detail a second picture has too, around each pixel; returns (h, w).
 
-    It is the slope of the regression of the other's detail on the one's. Both are (h, w, c), mask (h, w). Detail is the
-    difference from the mean over BAND pixels.
+    picture, second (h, w, c), mask (h, w). Detail is the difference from the Gaussian mean of standard deviation BAND
+    pixels. The share is the slope of the regression of the second picture's detail on the first's, in Gaussian windows
+    of standard deviation WINDOW pixels.
     """
-    fine, same = (x - masked_mean(x, mask, BAND) for x in (one, other))
-    return masked_mean((fine * same).sum(-1), mask, WINDOW) / (masked_mean((fine * fine).sum(-1), mask, WINDOW) + FLOOR)
+    fine, second_fine = (x - masked_mean(x, mask, BAND) for x in (picture, second))
+    covariance = masked_mean((fine * second_fine).sum(-1), mask, WINDOW)
+    return covariance / (masked_mean((fine * fine).sum(-1), mask, WINDOW) + FLOOR)
 
 
 def guided(values: np.ndarray, guide: np.ndarray, mask: np.ndarray, width: float, least: float) -> np.ndarray:
     """Fit values (h, w, c) by a linear function of a guide (h, w, g) around each pixel of mask (h, w).
 
-    This is the guided filter (He, Sun and Tang, "Guided Image Filtering", 2010) with Gaussian windows of width pixels.
-    least: added to the guide's variances, so that a guide that hardly varies explains little.
+    This is the guided filter (He, Sun and Tang, "Guided Image Filtering", 2010) with Gaussian windows. width: their
+    standard deviation in pixels. least: added to the guide's variances, in squared units of the guide, so that a guide
+    that hardly varies explains little.
     """
     mean, level = masked_mean(guide, mask, width), masked_mean(values, mask, width)
     variance = (

@@ -41,8 +41,9 @@ def read_image(path: str | Path) -> np.ndarray:
     Palettes are expanded, EXIF rotation is applied.
 
     Raises InputError for a file that is not one complete still image in grey or RGB, is not regular, or holds values
-    that are not finite; ResourceError beyond 16384 pixels a side, 1 GiB as stored, or MAX_HELD or half of the memory
-    while it is read; OutputError when the file cannot be read.
+    that are not finite. Raises ResourceError beyond 16384 pixels a side, beyond 1 GiB of stored pixels, and where
+    reading would take more than 4 GiB (MAX_HELD) or half of the memory. Raises OutputError when the file cannot be
+    read.
     """
     path = Path(path)
     require_regular_file(path)
@@ -55,7 +56,7 @@ def read_image(path: str | Path) -> np.ndarray:
     with _plain_name(path) as name, _quiet() if suffix_of(head) == ".exr" else contextlib.nullcontext():
         try:
             return _read(path, name)
-        except UnicodeDecodeError:  # OpenImageIO's binding hands names and messages out of the file over as text
+        except UnicodeDecodeError:  # OpenImageIO's binding decodes names and messages from the file
             raise InputError(path, "is damaged (its header is not text where it should be)", COPY) from None
 
 
@@ -110,7 +111,7 @@ def _read(path: Path, name: str) -> np.ndarray:
             raise InputError(path, f"is damaged or cut short ({_lower(fact) or 'the pixels cannot be read'})", COPY)
         file_format = source.format_name()
         if source.seek_subimage(1, 0):
-            raise InputError(path, "holds several images or an animation", "save the one that is meant as a still")
+            raise InputError(path, "holds several images or an animation", "save the wanted one as a still image")
         source.geterror()
     finally:
         source.close()
@@ -148,13 +149,14 @@ def _check_spec(path: Path, spec) -> None:
     if any("cmyk" in space or "ycck" in space or "ycbcrk" in space for space in spaces) or "C" in spec.channelnames[:1]:
         raise InputError(path, "is in CMYK", "convert it to RGB")
     if spec.get_int_attribute("oiio:Movie", 0):
-        raise InputError(path, "is an animation", "save one frame as a still")
+        raise InputError(path, "is an animation", "save one frame as a still image")
 
 
 def _check_held(path: Path, spec, channels: int, itemsize: int, copied: bool) -> None:
-    """Raise ResourceError when reading takes more than MAX_HELD or half of the memory.
+    """Raise ResourceError where reading an image would take more than 4 GiB (MAX_HELD) or half of the memory.
 
-    channels: to be read, of itemsize bytes each as decoded.
+    channels: how many are read, each of itemsize bytes a pixel once decoded. copied: the pixels are copied once more,
+    to turn them or to put channels in order.
     """
     pixels = spec.width * spec.height * channels
     size = pixels * spec.format.size() + pixels * itemsize * (2 if copied else 1)
@@ -169,8 +171,8 @@ def _channels(path: Path, names: list[str]) -> list[int]:
     A multi-channel file may hold others.
     """
     if {"R", "G", "B"} <= set(names):
-        wanted = ["R", "G", "B", *(["A"] if "A" in names else [])]
-        return [names.index(name) for name in wanted]
+        rgba_names = ["R", "G", "B", *(["A"] if "A" in names else [])]
+        return [names.index(name) for name in rgba_names]
     if 1 <= len(names) <= 4:
         return list(range(len(names)))
     if "Y" in names:
@@ -288,7 +290,7 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
         good = target.open(name, spec) and target.write_image(stored) and target.close()
         fact = target.geterror()
     try:
-        same = good and np.array_equal(_again(path), stored)
+        same = good and np.array_equal(_read_back(path), stored)
     except (InputError, ResourceError):
         same = False
     if not same:
@@ -297,12 +299,12 @@ def _write(path: Path, image: np.ndarray, kind: str) -> None:
         raise OutputError(
             path,
             f"was not written whole "
-            f"({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back otherwise'})",
+            f"({_lower(fact.strip().splitlines()[0]) if fact.strip() else 'it reads back differently'})",
             "free some space or choose another -o",
         )
 
 
-def _again(path: Path) -> np.ndarray:
+def _read_back(path: Path) -> np.ndarray:
     """Read the stored pixels, before alpha is divided."""
     import OpenImageIO as oiio
 

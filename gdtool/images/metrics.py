@@ -119,14 +119,14 @@ def scalar_error(values: np.ndarray, true_values: np.ndarray, true_mask: np.ndar
     return float(np.abs(np.asarray(values, np.float64) - true_values)[where].mean()) if where.any() else float("nan")
 
 
-def common(mask: np.ndarray, true_mask: np.ndarray) -> np.ndarray:
+def on_both_objects(mask: np.ndarray, true_mask: np.ndarray) -> np.ndarray:
     """Find the pixels wholly on the object in both, at which normals and depths can be compared."""
     return (mask > FULL) & (true_mask > FULL)
 
 
 def normal_degrees(normal: np.ndarray, mask: np.ndarray, true_normal: np.ndarray, true_mask: np.ndarray) -> float:
     """Compute the mean angle, in degrees, between unit normals (k, h, w, 3) over the pixels on both objects."""
-    where = common(mask, true_mask)
+    where = on_both_objects(mask, true_mask)
     a, b = np.asarray(normal[where], np.float64), np.asarray(true_normal[where], np.float64)
     # The angle by atan2: arccos of a float32 dot product cannot tell 0 from 0.02 degrees.
     angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), (a * b).sum(-1))
@@ -135,7 +135,7 @@ def normal_degrees(normal: np.ndarray, mask: np.ndarray, true_normal: np.ndarray
 
 def depth_error(depth: np.ndarray, mask: np.ndarray, true_depth: np.ndarray, true_mask: np.ndarray) -> float:
     """Compute the mean absolute difference in world units over the pixels on both objects."""
-    where = common(mask, true_mask)
+    where = on_both_objects(mask, true_mask)
     return float(np.abs(np.asarray(depth, np.float64) - true_depth)[where].mean()) if where.any() else float("nan")
 
 

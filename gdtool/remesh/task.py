@@ -204,7 +204,7 @@ class RemeshPatch:
         inward = -normals[face_idx]
         hits = RayCaster(self.mesh, 1).first_hit(points + _RAY_OFFSET * self.edge * inward, inward)
         leaves = dot(normals[hits.face_idx].T, inward.T) > _WALL_COSINE
-        return bool((hits.found & leaves & (hits.distance < _WALL_EDGES * self.edge)).mean() > _MAX_WALL_SHARE)
+        return bool((hits.is_hit & leaves & (hits.distance < _WALL_EDGES * self.edge)).mean() > _MAX_WALL_SHARE)
 
     @cached_property
     def features(self) -> Features:

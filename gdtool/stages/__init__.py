@@ -1,1 +1,1 @@
-"""Declare the stages: each turns folders into arrays, calls the rooms, and writes a folder."""
+"""Declare the stages: each turns folders into arrays, calls the packages that compute, and writes a folder."""

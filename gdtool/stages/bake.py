@@ -23,7 +23,7 @@ from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stag
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of bake."""
+    """Hold the options of `gdtool bake`."""
 
     size: (
         Annotated[

@@ -61,7 +61,7 @@ def require_model(option: str, value: str) -> None:
     if Path(value).suffix.lower() not in SUFFIXES:
         raise InputError(
             value,
-            "is no model file by its ending",
+            "does not have the suffix of a model file",
             f"name a {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file with {option}",
         )
 

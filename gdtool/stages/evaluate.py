@@ -28,7 +28,7 @@ Report = dict[str, bool | int | float | str]
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of evaluate."""
+    """Hold the options of `gdtool evaluate`."""
 
     frame: Annotated[
         Literal["auto", "source", "box", "same"],
@@ -108,9 +108,10 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
 
 
 def _reference_pictures(result: Folder, reference: Source | None) -> Folder:
-    """Return the folder that pictures are measured against: the given one, else one of its kind along the provenance.
+    """Return the folder that the pictures of a result are measured against.
 
-    Raises UsageError where there is none, InputError for a reference of another kind.
+    This is the reference, where one is named, else a folder of the result's kind along the provenance chain. Raises
+    UsageError where there is none, InputError for a reference of another kind.
     """
     from gdtool.evaluation.references import kind_of, path_of
 

@@ -21,7 +21,7 @@ from gdtool.core.stage import Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of import-views."""
+    """Hold the options of `gdtool import-views`."""
 
     format: Annotated[
         Literal["auto", "wonder3d", "nerf", "plain"],
@@ -48,7 +48,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     with out.step("read"):
         module = adapters.adapter(inputs.path, options.format)
         pictures = module.read(inputs.path)
-    mask = adapters.without_traces(pictures.mask)
+    mask = adapters.zero_faint_coverage(pictures.mask)
     if not (mask > 0.5).any():
         raise InputError(
             inputs.path, "every mask is empty", "give pictures with an alpha, or white masks as mask/VIEW.png"

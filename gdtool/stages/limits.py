@@ -18,26 +18,30 @@ _QUICK = 0.5
 
 
 @contextmanager
-def held_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]:
-    """Raise ResourceError in a block that takes longer than OVER x seconds + MORE.
+def limited_to(seconds: float, option: str, name: str, cure: str) -> Iterator[None]:
+    """Raise ResourceError in a block that takes so long that the run could not end within OVER * seconds + MORE
+    seconds.
 
-    option: the option that gives the seconds. name: of the object. cure: what to do about it.
+    seconds: the time limit that the user gave by `option`. name: of the object, and cure: what to do about it, for the
+    message.
     """
-    most = OVER * seconds + MORE - _UNWIND
+    latest = OVER * seconds + MORE - _UNWIND
     with time_limit(
-        most, ResourceError(name, f"is not done after {most:g} s, and {option} {seconds:g} allows no more", cure)
+        latest, ResourceError(name, f"is not done after {latest:g} s, and {option} {seconds:g} allows no more", cure)
     ):
         yield
 
 
 def require_time(needed: float, seconds: float, option: str, name: str, cure: str) -> None:
-    """Raise ResourceError, before the work, where even the quickest method takes longer than held_to() permits.
+    """Raise ResourceError before the work starts, where even the quickest method would take longer than limited_to()
+    allows.
 
-    needed: seconds of the quickest method on the machine that it was measured on.
+    needed: seconds of the quickest method on the machine where it was measured. seconds, option, name, cure: as for
+    limited_to().
     """
     if _QUICK * needed > OVER * seconds + MORE - _UNWIND:
         raise ResourceError(
             name,
-            f"needs about {math.ceil(needed)} s in the quickest way, and {option} {seconds:g} allows less",
+            f"needs about {math.ceil(needed)} s even with the quickest method, and {option} {seconds:g} allows less",
             f"raise {option} to {math.ceil(needed)}, or {cure}",
         )

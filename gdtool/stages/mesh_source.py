@@ -54,12 +54,12 @@ def read_triangles(inputs: Inputs, out: Output):
         scene = _load_scene(inputs, out)
         vertices, faces = scene.vertices, scene.faces.astype(np.int64)
     check(TriMesh(vertices, faces), source_path(inputs))
-    kept = compact(TriMesh(vertices, faces))
-    _require_extent(float(np.ptp(kept.vertices, 0).max()), inputs)
-    matrix = unit_box(kept.vertices)
+    compacted = compact(TriMesh(vertices, faces))
+    _require_extent(float(np.ptp(compacted.vertices, 0).max()), inputs)
+    matrix = unit_box(compacted.vertices)
     if quads is not None:
         quads = compact(QuadMesh(vertices, quads)).faces
-    return transform_points(invert_similarity(matrix), kept.vertices), kept.faces, matrix, quads
+    return transform_points(invert_similarity(matrix), compacted.vertices), compacted.faces, matrix, quads
 
 
 def read_quad_mesh(inputs: Inputs, out: Output):

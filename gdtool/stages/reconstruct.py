@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of reconstruct."""
+    """Hold the options of `gdtool reconstruct`."""
 
     method: Annotated[
         Literal["grid", "paper"],
@@ -76,11 +76,14 @@ def check(inputs: Inputs, options: Options) -> None:
 
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
-    """Reconstruct one views folder. Raises ResourceError where it takes much longer than --budget (limits.held_to)."""
-    from gdtool.stages.limits import held_to
+    """Reconstruct one views folder.
+
+    Raises ResourceError where it takes much longer than --budget (limits.limited_to).
+    """
+    from gdtool.stages.limits import limited_to
 
     cure = f"raise --budget to {max(round(2 * options.budget), 1)}, or leave it out"
-    with held_to(options.budget, "--budget", inputs.name, cure) if options.budget else contextlib.nullcontext():
+    with limited_to(options.budget, "--budget", inputs.name, cure) if options.budget else contextlib.nullcontext():
         _reconstruct(inputs.folder, options, out)
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of relight."""
+    """Hold the options of `gdtool relight`."""
 
     env: Annotated[
         str | None,
@@ -114,7 +114,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.shading.render.placement import in_unit_box
     from gdtool.shading.render.render import Renderer
     from gdtool.shading.render.rigs import turntable
-    from gdtool.stages.limits import held_to
+    from gdtool.stages.limits import limited_to
 
     torch.set_num_threads(1)  # shading runs in threads of this program
     with out.step("read"):
@@ -127,7 +127,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     how = PictureOptions(options.samples, options.exposure, options.brdf, options.budget, options.target_psnr)
     cure = "raise --budget, or lower --size or --views"
     held = (
-        contextlib.nullcontext() if options.budget is None else held_to(options.budget, "--budget", inputs.name, cure)
+        contextlib.nullcontext()
+        if options.budget is None
+        else limited_to(options.budget, "--budget", inputs.name, cure)
     )
     with held, out.step("render"):
         renderer, direct = Renderer(scene, out.threads), None
@@ -137,7 +139,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         pictures = render_pictures(renderer, direct or lobes, cameras, how, out.progress)
     with out.step("write"):
         _write(out, cameras, pictures.images)
-    _tell(out, options, renderer, direct, pictures, how.most_samples)
+    _record_skips(out, options, renderer, direct, pictures, how.most_samples)
     out.content = RendersContent(
         frames=len(cameras),
         environment=environment.name,
@@ -167,7 +169,7 @@ def _write(out: Output, cameras: list[Camera], pictures: list[np.ndarray]) -> No
     write_png(out.path("contact_sheet.png"), square_sheet(pictures))
 
 
-def _tell(
+def _record_skips(
     out: Output, options: Options, renderer: Renderer, direct: DirectLight | None, pictures: Pictures, samples: int
 ) -> None:
     """Record what was left out, and warn of a --target-psnr that was not reached.

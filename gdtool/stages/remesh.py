@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of remesh."""
+    """Hold the options of `gdtool remesh`."""
 
     faces: Annotated[int, Meta(ge=16, le=2_000_000, description="Number of quads, met within 3 %.")] = 20000
     quad_size: Annotated[
@@ -94,10 +94,10 @@ def check(inputs: Inputs, options: Options) -> None:
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Remesh one surface or mesh file; raise ResourceError where it takes much longer than --seconds."""
     from gdtool.remesh.limits import SECONDS_PER_QUAD
-    from gdtool.stages.limits import held_to
+    from gdtool.stages.limits import limited_to
 
     enough = max(round(SECONDS_PER_QUAD * options.faces), round(2 * options.seconds), 1)
-    with held_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
+    with limited_to(options.seconds, "--seconds", inputs.name, f"raise --seconds to {enough}, or lower --faces"):
         _remesh(inputs, options, out)
 
 
@@ -186,7 +186,7 @@ def _clean(mesh: TriMesh, inputs: Inputs, options: Options, out: Output) -> TriM
 
 
 def _goal(options: Options):
-    """Make the room's Goal of the options."""
+    """Convert the options to the Goal that remesh.methods reads."""
     from gdtool.remesh.methods import Goal
     from gdtool.remesh.task import Request
 

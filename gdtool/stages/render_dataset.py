@@ -29,7 +29,7 @@ ALL = (*DOMAINS, "closed_form")  # every image that a view can have
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of render-dataset."""
+    """Hold the options of `gdtool render-dataset`."""
 
     size: Annotated[int, Meta(ge=16, le=4096, description="Width and height of a view, pixels.")] = 256
     samples: Annotated[
@@ -161,10 +161,10 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             model=generated,
             report=dataset.figures(scene, renderer, mask, lamps),
         )
-    _tell_skips(out, renderer, options, lamps)
+    _record_skips(out, renderer, options, lamps)
 
 
-def _tell_skips(out: Output, renderer: Renderer, options: Options, lamps: PreparedLight | None) -> None:
+def _record_skips(out: Output, renderer: Renderer, options: Options, lamps: PreparedLight | None) -> None:
     """Record what the scene and the options did not need."""
     from gdtool.shading.render.skipped_work import skipped_work
 

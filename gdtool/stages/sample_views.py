@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of sample-views."""
+    """Hold the options of `gdtool sample-views`."""
 
     steps: (
         Annotated[

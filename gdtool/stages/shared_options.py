@@ -20,4 +20,4 @@ Fov = Annotated[float, Meta(ge=0, le=120, description="Field of view across, deg
 Brdf = Annotated[
     Literal["gltf", "paper"], Meta(description="Reflection model of lit pictures; gltf is what engines use.")
 ]
-Seed = Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of everything random.")]
+Seed = Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of all random choices.")]

@@ -5,9 +5,9 @@ WebDataset's naming. It writes a model folder for sample-views: weights, configu
 images.
 
 Use it to train the small configuration on a processor, to go on from a model you have (--start; with --size, at a
-larger size), or, with --preset paper, to extend Stable Diffusion to six domains. Killed at any time, the same command
-goes on where it was. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1 splits
-the weights as well). --plan predicts the cost of a configuration, without data.
+larger size), or, with --preset paper, to extend Stable Diffusion to six domains. A training may be killed at any time:
+the same command resumes it. `torchrun --nproc_per_node N -m -- gdtool train …` trains in N processes (GDTOOL_SHARD=1
+splits the weights as well). --plan predicts the cost of a configuration, without data.
 
 Example:
   gdtool render-dataset procedural:0..99 --size 64 -o objects && gdtool train objects --minutes 60 -o my-model
@@ -29,7 +29,7 @@ HELD_OUT = 4  # objects; all but one where there are fewer
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of train."""
+    """Hold the options of `gdtool train`."""
 
     preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
     ablation: Annotated[
@@ -125,8 +125,8 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         folders, count = views_folders(inputs.on_disk, out.workspace), count_views_folders(inputs.on_disk)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     used = len(objects) - min(options.held_out, len(objects) - 1)
-    shown, objects = objects.part(slice(used, None)), objects.part(slice(used))
-    recorder = Recorder(out.workspace, shown, train_config.precision, options.tensorboard)
+    held_out_objects, objects = objects.part(slice(used, None)), objects.part(slice(used))
+    recorder = Recorder(out.workspace, held_out_objects, train_config.precision, options.tensorboard)
     distributed.start()
     run_options = RunOptions(
         options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device
@@ -142,14 +142,16 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def follow(threads: int) -> None:
-    """Train as a process of torchrun that is not the first: wait for the first one's order, follow it, and end."""
+    """Train in a process of torchrun other than the first: wait until the first process sends its options, and train
+    with it.
+    """
     from gdtool.diffusion.training import worker
 
     worker.follow(threads)
 
 
 def dismiss() -> None:
-    """Let the other processes end, as the first one's last step."""
+    """Tell the other processes of torchrun to end; the first process calls this last."""
     from gdtool.diffusion.training import distributed
 
     distributed.leave()
@@ -164,7 +166,7 @@ def plan(options: Options, as_json: bool) -> str:
 
 
 def configured(options: Options):
-    """Apply the ablation, --config and the flags to the preset. Raises InputError."""
+    """Return the configurations: the preset, changed by the ablation, --config and the flags. Raises InputError."""
     from gdtool.diffusion.configure import configuration
 
     # Without --steps the minutes decide when the training ends.

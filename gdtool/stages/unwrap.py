@@ -21,7 +21,7 @@ from gdtool.core.stage import MOST_SECONDS, Inputs, Output, Stage
 
 
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Options of unwrap."""
+    """Hold the options of `gdtool unwrap`."""
 
     size: Annotated[int, Meta(ge=16, le=65536, description="Side of the texture that the padding is for, texels.")] = (
         2048
@@ -58,10 +58,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Unwrap one mesh; raise ResourceError where it takes much longer than --seconds."""
-    from gdtool.stages.limits import held_to
+    from gdtool.stages.limits import limited_to
 
     cure = f"raise --seconds to {max(round(2 * options.seconds), 1)}, or run gdtool remesh with fewer --faces before"
-    with held_to(options.seconds, "--seconds", inputs.name, cure):
+    with limited_to(options.seconds, "--seconds", inputs.name, cure):
         _unwrap(inputs, options, out)
 
 
@@ -111,7 +111,7 @@ def _unwrap(inputs: Inputs, options: Options, out: Output) -> None:
 
 
 def _keeps_uv(mesh, options: Options, inputs: Inputs, out: Output) -> bool:
-    """Tell whether the mesh's own texture coordinates are kept; record it, or warn why they are not."""
+    """Tell whether the input's texture coordinates are kept; record that they are, or warn why they are not."""
     from gdtool.unwrap.pipeline import invalid_reason
 
     if mesh.uv is None or options.redo:
@@ -180,7 +180,7 @@ def _with_wide_indices(mesh):
 
 
 def _twins(mesh, options: Options, inputs: Inputs, out: Output):
-    """Find twins and corners as mirror_twins() does; without --symmetry no face has a twin."""
+    """Return the mirror twin (f,) of each face and its corners (f, 4); -1 for none, and without --symmetry."""
     import numpy as np
 
     from gdtool.geometry.meshes import QuadMesh

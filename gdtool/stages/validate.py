@@ -61,7 +61,7 @@ def _checks() -> ModuleType:
 
 
 def _unreadable_as_fault(check: Callable[[], Iterator[str]]) -> Iterator[str]:
-    """Yield the faults that a check finds; a file that it cannot read is the last one."""
+    """Yield the faults that a check finds; a file that the check cannot read ends it and is the last fault."""
     try:
         yield from check()
     except InputError as error:
@@ -71,8 +71,8 @@ def _unreadable_as_fault(check: Callable[[], Iterator[str]]) -> Iterator[str]:
 def _check_key(folder: Folder) -> Iterator[str]:
     """Compare a folder's key with the one that its stage, version, options and inputs give.
 
-    A manifest without a key passes, and one of another program's stage. So does one with an option that names a file
-    that is not there any more: the file's digest is part of the key.
+    Three kinds of folder are not checked and pass: a folder without a key, one of a stage of another program, and one
+    with an option that names a file which does not exist any more, because the digest of that file is part of the key.
     """
     manifest = folder.manifest
     if not manifest.key or manifest.stage not in STAGES:

@@ -9,7 +9,7 @@ import pytest
 from gdtool.assets.load import load_scene
 from gdtool.core.errors import GdtoolError
 from gdtool.images.io import encode_png, read_image, write_exr
-from tests.assets.gltf_files import quad
+from tests.assets.gltf.files import quad
 from tests.assets.test_load import FACES, ply, stl
 
 OBJ = (

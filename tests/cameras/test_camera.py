@@ -20,7 +20,9 @@ def test_the_rig_stands_where_the_format_says():
 
 
 def test_nothing_is_mirrored():
-    """+X is on the right of the front picture and on the left of the back one; +Y is up; +Z is right seen from -X."""
+    """+X is on the right of the front picture and on the left of the back one. +Y is up. +Z is on the right seen from
+    -X.
+    """
     cameras = {c.name: c for c in rig("six", 100)}
     x, y, z = np.eye(3) * 0.36
 

@@ -131,14 +131,14 @@ def test_a_log_file_that_cannot_be_written_is_an_error_before_any_work(gdtool, t
 
 
 @pytest.mark.parametrize(
-    "words, wanted", [("gdtool rem", "remesh"), ("gdtool remesh --fa", "--faces"), ("gdtool relight --light s", "sg")]
+    "words, expected", [("gdtool rem", "remesh"), ("gdtool remesh --fa", "--faces"), ("gdtool relight --light s", "sg")]
 )
-def test_the_shell_completes_commands_options_and_values(gdtool, monkeypatch, words, wanted):
+def test_the_shell_completes_commands_options_and_values(gdtool, monkeypatch, words, expected):
     monkeypatch.setenv("_GDTOOL_COMPLETE", "bash_complete")
     monkeypatch.setenv("COMP_WORDS", words)
     monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
     done = gdtool()
-    assert f"plain,{wanted}" in done.stdout.splitlines()
+    assert f"plain,{expected}" in done.stdout.splitlines()
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])

@@ -16,7 +16,7 @@ from tests.conftest import ROOT
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    """Let children import this file."""
+    """Set PYTHONPATH so that children can import this file."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
@@ -26,7 +26,7 @@ def double(array, noise=""):
 
 
 def of_own_type(arrays):
-    """Tell which arrays have a type object of numpy's own, and return the arrays too."""
+    """Tell which arrays have one of numpy's own type objects, not a copy of it; returns the arrays too."""
     return [array.dtype is np.dtype(array.dtype.str) for array in arrays], arrays
 
 
@@ -145,10 +145,10 @@ def test_children_run_in_parallel_within_their_limits():
     running = [child.begin(large, seconds=30) for _ in range(2)] + [child.begin(hang, seconds=1)]
     deadline = time.monotonic() + 30
     # Nobody has asked for a result yet.
-    while any(one._process.returncode is None for one in running) and time.monotonic() < deadline:
+    while any(child._process.returncode is None for child in running) and time.monotonic() < deadline:
         time.sleep(0.05)
-    assert all(one._process.returncode is not None for one in running)
-    assert [len(one.result()) for one in running[:2]] == [2**20] * 2
+    assert all(child._process.returncode is not None for child in running)
+    assert [len(child.result()) for child in running[:2]] == [2**20] * 2
     with pytest.raises(child.ChildFailed, match="longer than 1 s"):
         running[2].result()
 
@@ -188,8 +188,10 @@ def test_a_grandchild_dies_with_its_parent(tmp_path):
 
 def below(pid):
     """List the processes that a process started, and those that they started."""
-    own = [int(one) for one in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()]
-    return own + [other for one in own for other in below(one)]
+    child_pids = [
+        int(word) for word in subprocess.run(["pgrep", "-P", str(pid)], capture_output=True, text=True).stdout.split()
+    ]
+    return child_pids + [other for word in child_pids for other in below(word)]
 
 
 def alive(pid):

@@ -77,8 +77,8 @@ def test_a_stage_is_short(path):
 
 def test_package_list_is_the_tree():
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
-    found = {".".join(p.parent.relative_to(ROOT).parts) for p in ROOT.glob("gdtool/**/__init__.py")}
-    assert listed == found | {"gdtool.commands", "gdtool.schemas", "gdtool.models.default"}
+    packages = {".".join(p.parent.relative_to(ROOT).parts) for p in ROOT.glob("gdtool/**/__init__.py")}
+    assert listed == packages | {"gdtool.commands", "gdtool.schemas", "gdtool.models.default"}
 
 
 def test_every_command_has_its_file_and_stage():

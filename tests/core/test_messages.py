@@ -60,9 +60,9 @@ def options_of(command):
     """Return all spellings of a command's options, and of gdtool's own."""
     from gdtool.commands._group import cli
 
-    found = importlib.import_module("gdtool.commands." + command.replace("-", "_")).command
-    with click.Context(found) as context:
-        params = [*found.get_params(context), *cli.params]
+    click_command = importlib.import_module("gdtool.commands." + command.replace("-", "_")).command
+    with click.Context(click_command) as context:
+        params = [*click_command.get_params(context), *cli.params]
     return {"--help", "--version"} | {
         name for param in params if isinstance(param, click.Option) for name in (*param.opts, *param.secondary_opts)
     }
@@ -71,19 +71,19 @@ def options_of(command):
 @cache
 def mentioned(module):
     """Return the modules of gdtool that a module imports anywhere, or names as "module:function" in a string."""
-    found = set()
+    modules = set()
     for node in ast.walk(FILES[MODULES[module]]):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
-            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+            modules |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif (
             isinstance(node, ast.Constant)
             and isinstance(node.value, str)
             and re.fullmatch(r"gdtool(\.\w+)+(:\w+)?", node.value)
         ):
-            found.add(node.value.partition(":")[0])
-    return found & MODULES.keys()
+            modules.add(node.value.partition(":")[0])
+    return modules & MODULES.keys()
 
 
 @cache
@@ -120,11 +120,11 @@ def place_of_cure(function):
 def default_cure(function):
     """Return the default of a function's `cure`; None where it has none."""
     arguments = [*function.args.posonlyargs, *function.args.args]
-    given = zip(arguments[len(arguments) - len(function.args.defaults) :], function.args.defaults, strict=True)
+    defaults = zip(arguments[len(arguments) - len(function.args.defaults) :], function.args.defaults, strict=True)
     return next(
         (
             value
-            for argument, value in (*given, *zip(function.args.kwonlyargs, function.args.kw_defaults, strict=True))
+            for argument, value in (*defaults, *zip(function.args.kwonlyargs, function.args.kw_defaults, strict=True))
             if argument.arg == "cure"
         ),
         None,
@@ -171,24 +171,28 @@ def constants(file):
     return own
 
 
-def texts(node, known):
+def texts(node, named_strings):
     """Return the texts that an expression can be, with "…" for unknown parts; none where nothing is known."""
     if isinstance(node, ast.Constant):
         return [node.value] if isinstance(node.value, str) else []
     if isinstance(node, ast.JoinedStr):
         out = [""]
         for part in node.values:
-            inner = texts(part.value if isinstance(part, ast.FormattedValue) else part, known) or ["…"]
+            inner = texts(part.value if isinstance(part, ast.FormattedValue) else part, named_strings) or ["…"]
             out = [text + one for text in out for one in inner]
         return out
     if isinstance(node, ast.IfExp):
-        return texts(node.body, known) + texts(node.orelse, known)
+        return texts(node.body, named_strings) + texts(node.orelse, named_strings)
     if isinstance(node, ast.BoolOp):
-        return [text for value in node.values for text in texts(value, known)]
+        return [text for value in node.values for text in texts(value, named_strings)]
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
-        return [one + two for one in texts(node.left, known) or ["…"] for two in texts(node.right, known) or ["…"]]
-    if isinstance(node, ast.Name) and node.id in known:
-        return texts(known[node.id], {})
+        return [
+            one + two
+            for one in texts(node.left, named_strings) or ["…"]
+            for two in texts(node.right, named_strings) or ["…"]
+        ]
+    if isinstance(node, ast.Name) and node.id in named_strings:
+        return texts(named_strings[node.id], {})
     if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):  # repair.NO_AREA
         found = [file for module, file in MODULES.items() if module.endswith("." + node.value.id)]
         return [text for file in found for text in texts(constants_of(FILES[file]).get(node.attr), {})]
@@ -254,7 +258,7 @@ def test_every_error_has_a_cure():
     assert not lacking, f"say what removes the fault: {lacking}"
 
 
-def test_no_function_has_a_cure_of_nothing():
+def test_no_function_has_an_empty_default_cure():
     """A parameter `cure` has no default, or one that is not empty; with None the function supplies the text."""
     lacking = [
         f"{file}:{function.lineno} {function.name}"

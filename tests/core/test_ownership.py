@@ -149,7 +149,7 @@ def test_an_output_whose_name_holds_a_line_break(cat):
     assert "control character" in refused(cat, output=Path("out\nside"))
 
 
-def test_files_put_there_while_the_run_works_stay(made, monkeypatch):
+def test_files_that_appear_in_the_output_during_a_run_stay(made, monkeypatch):
     def run_and_meddle(inputs, options, out):
         (made / "late.txt").write_text("mine")
         return STAGE.run(inputs, options, out)
@@ -204,9 +204,9 @@ def test_clearing_does_not_follow_a_link():
     assert Path("mine/file").read_text() == "x"
 
 
-def test_a_file_of_the_users_at_the_locks_place_stays():
+def test_a_users_file_with_the_name_of_the_lock_stays():
     Path(".out.lock").write_text("mine")
-    with pytest.raises(OutputError, match="in the way"), locked(Path("out")):
+    with pytest.raises(OutputError, match="lock file"), locked(Path("out")):
         pass
     assert Path(".out.lock").read_text() == "mine"
 
@@ -233,7 +233,7 @@ def test_an_old_output_of_another_user_stops_the_run_before_it_starts(made):
     if not pid:
         os.setuid(65534)
         (error,) = run("cat.png", output=made)
-        right = isinstance(error, OutputError) and "closed to writing" in str(error)
+        right = isinstance(error, OutputError) and "not writable" in str(error)
         os._exit(0 if right else 1)
     assert os.waitpid(pid, 0)[1] == 0
     assert sorted(path.name for path in Path().iterdir()) == ["cat.png", "out"]

@@ -48,7 +48,7 @@ def test_the_chain_is_found_and_paths_stay_readable(chain):
     assert missing_origin(chain, CURE) is None
 
 
-def test_a_folder_that_was_replaced_is_told_and_refused(chain):
+def test_a_folder_that_was_replaced_is_reported_and_refused(chain):
     Path("cat.png").write_bytes(b"dog")
     run(STAGE, "cat.png", "a/first")
     with pytest.raises(InputError, match="renders is not the one that renders a/second was made from"):
@@ -57,13 +57,13 @@ def test_a_folder_that_was_replaced_is_told_and_refused(chain):
         second_inputs(NEXT, chain, {})
 
 
-def test_a_source_file_that_was_replaced_is_told_and_refused(chain):
+def test_a_source_file_that_was_replaced_is_reported_and_refused(chain):
     Path("cat.png").write_bytes(b"dog")
     with pytest.raises(InputError, match="source is not the one"):
         find_source(chain, CURE)
 
 
-def test_what_was_moved_is_told(chain):
+def test_an_input_that_was_moved_is_reported(chain):
     shutil.move("a/first", "elsewhere")
     assert find_ancestor(chain, "views", CURE) is None
     assert missing_origin(chain, CURE).path == Path.cwd() / "a/first"
@@ -81,12 +81,12 @@ def test_a_path_through_a_linked_folder_records_where_things_really_lie():
     folder = run(STAGE, "cat.png", "link/out")
     assert folder.manifest.inputs[0].path == "../../../cat.png"
     assert Path(find_source(folder, CURE)).read_bytes() == b"cat"
-    again = run(NEXT, "link/out", "link/second")
-    assert [one.manifest.digest for one in ancestors(again, CURE)] == [folder.manifest.digest]
+    second = run(NEXT, "link/out", "link/second")
+    assert [ancestor.manifest.digest for ancestor in ancestors(second, CURE)] == [folder.manifest.digest]
     moved = Path("b/c/d")
     moved.mkdir(parents=True)
     Path("disk").rename("b/c/d/disk")  # a chain that moves as a whole is whole
-    assert [one.manifest.digest for one in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
+    assert [ancestor.manifest.digest for ancestor in ancestors(open_folder(moved / "disk/deep/second"), CURE)] == [
         folder.manifest.digest
     ]
 

@@ -53,7 +53,7 @@ def test_only_regular_files_are_read(tmp_path):
             ("none", "does not exist"),
             (".", "folder"),
             ("x" * 300, "too long"),
-            ("a\0b", "no name"),
+            ("a\0b", "not a file name"),
         ):
             answer = []
             thread = threading.Thread(

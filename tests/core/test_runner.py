@@ -46,7 +46,7 @@ def leftovers(folder="."):
     return [p.name for p in Path(folder).rglob(".*")]
 
 
-def test_result_is_whole_and_described():
+def test_a_result_is_complete_and_its_manifest_describes_it():
     Path("cat.png").write_bytes(b"cat")
     (result,) = run("cat.png")
     assert str(result.path) == "cat.asset/renders"
@@ -168,7 +168,7 @@ def test_stdin_json_dry_run_and_exit_codes():
     assert toy("cat.png", "--repeat", "0").returncode == 2
 
 
-def test_read_only_place_exits_4_and_missing_reader_141():
+def test_read_only_folder_exits_4_and_missing_reader_141():
     Path("cat.png").write_bytes(b"cat")
     Path("file").write_text("")
     assert toy("cat.png", "-o", "file/x").returncode == 4
@@ -221,7 +221,7 @@ def test_interrupted_leaves_nothing(sign, code):
     assert not Path("cat.asset/renders").exists()
 
 
-def test_killed_at_random_moments_the_old_or_the_new_is_there():
+def test_killed_at_random_moments_the_old_or_the_new_result_is_complete():
     Path("cat.png").write_bytes(b"old")
     run("cat.png", options=Options(repeat=2))
     old = read_manifest(Path("cat.asset/renders")).digest
@@ -269,6 +269,6 @@ def test_a_folder_that_ships_with_gdtool_is_an_input_like_any_other():
     from gdtool.core.second_inputs import second_inputs
     from gdtool.stages.sample_views import STAGE as sample_views
 
-    found = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
-    assert found.kind == "model"
-    assert found.name == "default"
+    model = second_inputs(sample_views, Path("cat.png"), {"model": None}).by_flag["model"]
+    assert model.kind == "model"
+    assert model.name == "default"

@@ -26,7 +26,7 @@ from gdtool.folders.views import read_views
 from gdtool.images import io as image_io
 from gdtool.images.io import read_image, write_exr, write_png
 from gdtool.shading.lights.load import load_environment
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, quad
 from tests.conftest import ROOT
 from tests.fields.shapes import torus, views_folder
 from tests.fields.shapes import views_of as seen
@@ -35,14 +35,14 @@ from tests.fields.shapes import views_of as seen
 @pytest.fixture
 def little_memory(monkeypatch):
     """Limit one input to 64 MiB, whatever machine the test runs on."""
-    monkeypatch.setattr(memory, "most_held", lambda: 64 << 20)
+    monkeypatch.setattr(memory, "max_input_bytes", lambda: 64 << 20)
 
 
 def test_the_memory_for_one_input_follows_the_limit_of_the_process():
     """In a child process, because a limit cannot be raised again."""
     code = (
-        "import resource; from gdtool.core.memory import most_held; a = most_held(); "
-        "resource.setrlimit(resource.RLIMIT_AS, (1 << 30,) * 2); print(a > most_held() == 1 << 29)"
+        "import resource; from gdtool.core.memory import max_input_bytes; a = max_input_bytes(); "
+        "resource.setrlimit(resource.RLIMIT_AS, (1 << 30,) * 2); print(a > max_input_bytes() == 1 << 29)"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT).stdout == "True\n"
 
@@ -250,7 +250,7 @@ def test_the_memory_of_reading_a_picture_is_predicted(tmp_path, little_memory, m
     write_exr(tmp_path / "x.exr", np.zeros((1200, 2048, 4), np.float32))
     with pytest.raises(ResourceError, match=r"2048x1200 pixels in 4 channels would take 0\.1 GiB of memory"):
         read_image(tmp_path / "x.exr")
-    monkeypatch.setattr(memory, "most_held", lambda: 1 << 40)
+    monkeypatch.setattr(memory, "max_input_bytes", lambda: 1 << 40)
     monkeypatch.setattr(image_io, "MAX_HELD", 32 << 20)
     with pytest.raises(ResourceError, match=r"more than the 0\.0 GiB"):
         read_image(tmp_path / "x.exr")
@@ -272,7 +272,7 @@ def test_an_environment_too_large_for_the_memory_is_refused(tmp_path, little_mem
 
 def test_the_memory_of_all_views_of_a_folder_is_summed(tmp_path, monkeypatch):
     folder = open_folder(views_folder(tmp_path / "a.asset" / "views", *seen(torus, 32)))
-    monkeypatch.setattr(memory, "most_held", lambda: 1 << 19)
+    monkeypatch.setattr(memory, "max_input_bytes", lambda: 1 << 19)
     with pytest.raises(ResourceError, match="6 views of 32x32 pixels"):
         read_views(folder)
 

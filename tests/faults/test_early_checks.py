@@ -69,7 +69,7 @@ def files(tmp_path):
         ("remesh cube.obj --quad-size 1e-300", 2, "is smaller than 1e-05"),
         ("bake cube.obj --device cuda", 5, "gdtool: --device cuda: is not there; use --device cpu"),
         ("bake cube.obj --model nothing.glb", 3, "nothing.glb: does not exist; check the path that --model gives"),
-        ("bake cube.obj --model notes.txt", 3, "notes.txt: is no model file by its ending"),
+        ("bake cube.obj --model notes.txt", 3, "notes.txt: does not have the suffix of a model file"),
         ("bake cube.obj", 3, "name one with --surface or --model"),
         ("bake cube.obj --surface nothing", 3, "nothing: does not exist"),
         (

@@ -347,8 +347,8 @@ def test_a_stage_ends_within_twice_its_seconds_plus_five():
     with pytest.raises(
         ResourceError,
         match=(
-            "mesh: needs about 220 s in the quickest way, and --seconds 10 allows less; raise --seconds to 220, or "
-            "lower"
+            "mesh: needs about 220 s even with the quickest method, and --seconds 10 allows less; "
+            "raise --seconds to 220, or lower"
         ),
     ):
         limits.require_time(220.0, 10.0, "--seconds", "mesh", "lower --faces")

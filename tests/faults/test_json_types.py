@@ -9,7 +9,7 @@ from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError
 from gdtool.core.references import referred_files
 from gdtool.folders.adapters import nerf
-from gdtool.folders.records import read_cameras, read_record
+from gdtool.folders.records import read_cameras, read_light
 from gdtool.images.io import write_png
 
 GLTF = '{"asset": {"version": "2.0"}, %s}'
@@ -62,7 +62,7 @@ def test_a_gltf_of_wrong_types_is_refused_with_the_place(tmp_path, part):
     "name", [f"TEXCOORD_{LONG}", "TEXCOORD_²", "TEXCOORD_\n"], ids=["long", "superscript", "line break"]
 )
 def test_a_malformed_attribute_name_is_no_uv_set(tmp_path, name):
-    from tests.assets.gltf_files import quad
+    from tests.assets.gltf.files import quad
 
     builder = quad()
     attributes = builder.document["meshes"][0]["primitives"][0]["attributes"]
@@ -204,5 +204,5 @@ def test_an_invalid_value_of_cameras_json_is_named(tmp_path, key, value):
 def test_a_light_json_of_another_structure_is_refused(tmp_path, text):
     (tmp_path / "light.json").write_text(text)
     with pytest.raises(InputError, match="light.json") as caught:
-        read_record(tmp_path / "light.json")
+        read_light(tmp_path / "light.json")
     assert caught.value.cure

@@ -7,7 +7,7 @@ import pytest
 
 from gdtool.core.folder import open_folder
 from gdtool.folders.mesh import read_mesh
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder
 from tests.faults.files import CUBE, QUADS, leftovers, lines_of
 
 TRIANGLES = np.concatenate([QUADS[:, :3], QUADS[:, [0, 2, 3]]])

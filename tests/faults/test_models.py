@@ -138,7 +138,7 @@ def test_a_network_larger_than_the_memory_is_refused_with_the_prediction(folder)
 
 def test_a_network_is_refused_when_too_little_memory_is_left(folder, monkeypatch):
     load_model(folder)
-    monkeypatch.setattr(memory, "most_held", lambda: 2**20)
+    monkeypatch.setattr(memory, "max_input_bytes", lambda: 2**20)
     with pytest.raises(ResourceError, match="million weights would take"):
         load_model(folder)
 

@@ -15,7 +15,7 @@ from gdtool.diffusion.data.archives import object_count, unpack_views
 from gdtool.folders.adapters import nerf, plain
 from gdtool.folders.views import read_views
 from gdtool.images.io import encode_png, write_png
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, with_textures
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, with_textures
 from tests.fields.shapes import torus, views_folder
 from tests.fields.shapes import views_of as seen
 

@@ -12,7 +12,7 @@ from gdtool.core.folder import Folder
 from gdtool.core.manifest import Manifest
 from gdtool.core.stage import Output
 from gdtool.folders.mesh import read_obj, write_obj
-from gdtool.folders.records import read_cameras, read_record, write_cameras, write_record
+from gdtool.folders.records import read_cameras, read_light, write_cameras, write_light
 from gdtool.folders.surface import Surface, read_surface, write_surface, write_surface_ply
 from gdtool.folders.views import Views, read_views, write_views
 from gdtool.geometry.meshes import QuadMesh
@@ -49,7 +49,7 @@ def random_views(size=16):
     return Views(cameras, images, mask, light)
 
 
-def test_views_come_back_within_their_quantisation():
+def test_views_are_read_as_written_within_their_quantisation():
     views = random_views()
     folder = written("views", lambda out: write_views(out, views, exposure=2.0))
     assert folder.content.domains == ("color", "normal", "depth", "albedo", "roughness", "metallic")
@@ -73,7 +73,7 @@ def test_views_of_another_size_than_their_camera_are_refused():
         read_views(folder)
 
 
-def test_cameras_come_back_and_bad_ones_are_refused():
+def test_cameras_are_read_as_written_and_bad_ones_refused():
     cameras = [camera_at(20, 10, name="a", size=8, fov_degrees=40), *rig("wonder3d", 8)]
     write_cameras(Path("c.json"), cameras)
     for before, after in zip(cameras, read_cameras(Path("c.json")), strict=True):
@@ -92,19 +92,19 @@ def test_cameras_come_back_and_bad_ones_are_refused():
             read_cameras(Path("bad.json"))
 
 
-def test_light_comes_back():
+def test_light_is_read_as_written():
     light = {
         "axes": np.eye(3)[:2],
         "sharpness": np.array([0.0, 5.0]),
         "amplitudes": np.ones((2, 3)),
         "fit_error": {"rms": 0.1},
     }
-    write_record(Path("l.json"), light)
-    assert np.array_equal(read_record(Path("l.json"))["axes"], light["axes"])
-    assert read_record(Path("l.json"))["fit_error"] == {"rms": 0.1}
+    write_light(Path("l.json"), light)
+    assert np.array_equal(read_light(Path("l.json"))["axes"], light["axes"])
+    assert read_light(Path("l.json"))["fit_error"] == {"rms": 0.1}
 
 
-def test_surface_comes_back_and_missing_properties_have_their_defaults():
+def test_surfaces_are_read_as_written_and_missing_properties_get_defaults():
     triangles = triangulated(QUADS)[0]
     n = len(CUBE)
     surface = Surface(
@@ -150,7 +150,7 @@ def test_surface_comes_back_and_missing_properties_have_their_defaults():
         read_surface(folder)
 
 
-def test_quads_come_back_with_their_texture_coordinates():
+def test_quads_are_read_as_written_with_texture_coordinates():
     uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
     mesh = QuadMesh(CUBE, QUADS, uv, np.tile(np.arange(4, dtype=np.int32), (6, 1)))
     write_obj(Path("m.obj"), mesh)

@@ -1,4 +1,4 @@
-"""Closed and open meshes of known shape, made in code."""
+"""Make closed and open meshes of known shape."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from gdtool.geometry.meshes import QuadMesh
 
 
 def cube(side: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Twelve triangles, outward, centred."""
+    """Make a cube of twelve triangles that face outward, centred at the origin."""
     vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     return (vertices - 0.5) * side, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])
 
 
 def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
-    """A cube of 6 * 4**rounds quads."""
+    """Make a cube of 6 * 4**rounds quads."""
     from gdtool.remesh.fit.surface_projection import subdivide
 
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -26,7 +26,7 @@ def quad_cube(rounds: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quad_torus(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """A torus of n x n quads, all vertices regular."""
+    """Make a torus of n x n quads, all of whose vertices are regular."""
     u, v = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     a, b = 2 * np.pi * u / n, 2 * np.pi * v / n
     points = np.stack([(2 + np.cos(b)) * np.cos(a), (2 + np.cos(b)) * np.sin(a), np.sin(b)], -1).reshape(-1, 3)
@@ -36,7 +36,10 @@ def quad_torus(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
 
 
 def marching(field, n: int, half: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Zero set of field(x, y, z), negative inside, on an n^3 grid over ±half; outward."""
+    """Extract the surface where field(x, y, z) is zero, on an n^3 grid over ±half.
+
+    The field is negative inside; faces look outward.
+    """
     from skimage.measure import marching_cubes
 
     line = np.linspace(-half, half, n)
@@ -55,7 +58,9 @@ def torus(n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lattice(cells: int = 3, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """A cube of what Schwarz' P surface bounds, of so many periods along an edge: of three, 28 handles."""
+    """Make the solid that Schwarz' P surface bounds inside a cube, with `cells` periods along an edge; three give 28
+    handles.
+    """
 
     def field(x, y, z):
         waves = sum(np.cos(np.pi * cells * (axis / 0.9 + 1)) for axis in (x, y, z))
@@ -65,7 +70,10 @@ def lattice(cells: int = 3, n: int = 40) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
-    """A box of half sides 0.8, 0.6, 0.5 with a bore of radius 0.3 along z: twelve straight creases and two circles."""
+    """Make a box of half sides 0.8, 0.6, 0.5 with a bore of radius 0.3 along z.
+
+    Its creases are twelve straight ones and two circles.
+    """
 
     def field(x, y, z):
         return np.maximum(np.maximum(np.maximum(abs(x) - 0.8, abs(y) - 0.6), abs(z) - 0.5), 0.3 - np.hypot(x, y))
@@ -74,7 +82,7 @@ def bored_box(n: int = 56) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rod(sections: int, radius: float = 0.03, height: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """A cylinder of slivers along z: two fans and a wall of two triangles a section."""
+    """Make a cylinder of slivers along z: two fans, and a wall with two triangles for each section."""
     angle = 2 * np.pi * np.arange(sections) / sections
     ring = radius * np.stack([np.cos(angle), np.sin(angle)], -1)
     vertices = np.concatenate(
@@ -96,7 +104,7 @@ def rod(sections: int, radius: float = 0.03, height: float = 0.5) -> tuple[np.nd
 
 
 def assembly(pins: int, sections: int) -> tuple[np.ndarray, np.ndarray]:
-    """A disk of radius 1 in a circle of so many pins, in a box of side 1."""
+    """Make a disk of radius 1 surrounded by a circle of pins, scaled into a box of side 1."""
     around = 2 * np.pi * np.arange(pins) / pins
     pin = rod(sections)
     vertices, faces = joined(
@@ -106,7 +114,7 @@ def assembly(pins: int, sections: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plane(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Open square of side 1 in z = 0, facing +z."""
+    """Make an open square of side 1 in z = 0 that faces +z."""
     line = np.linspace(-0.5, 0.5, n + 1)
     x, y = np.meshgrid(line, line)
     i = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()

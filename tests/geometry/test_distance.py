@@ -1,4 +1,4 @@
-"""Closest points, winding numbers and surface samples, on shapes whose answers are known."""
+"""Find closest points, winding numbers and surface samples on shapes whose answers are known."""
 
 import sys
 
@@ -40,7 +40,7 @@ def test_distances_to_a_square_from_above_beside_and_on_it():
     assert face_idx[4] == 1
 
 
-def test_vertices_without_faces_are_no_surface():
+def test_vertices_without_faces_are_ignored():
     vertices = np.concatenate([SQUARE, [[0.5, 0.5, 5]]])
     assert closest_points(np.array([[0.5, 0.5, 5.0]]), TriMesh(vertices, HALVES))[0] == pytest.approx(5)
 

@@ -1,4 +1,4 @@
-"""Bodies inside other bodies are counted, on solids whose positions are known."""
+"""Count bodies inside other bodies, on solids whose positions are known."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Grids: layout, and extraction of surfaces that are closed, also at the border and at exact zeros."""
+"""Lay out grids, and extract surfaces that are closed, also at the border and at exact zeros."""
 
 import numpy as np
 import pytest

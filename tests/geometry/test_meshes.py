@@ -1,4 +1,4 @@
-"""Mesh values: they keep their arrays, derive the rest once, and pickle the arrays alone."""
+"""Check that mesh values keep their arrays, derive the rest once, and pickle the arrays alone."""
 
 import pickle
 

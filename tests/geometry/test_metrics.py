@@ -1,4 +1,4 @@
-"""Surface metrics on shapes whose answers are known."""
+"""Measure surfaces whose distances are known."""
 
 import numpy as np
 import pytest

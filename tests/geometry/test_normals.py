@@ -1,4 +1,4 @@
-"""Face and vertex normals, also of faces without area."""
+"""Compute face and vertex normals, also of faces without area."""
 
 import numpy as np
 import pytest

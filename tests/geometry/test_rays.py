@@ -1,4 +1,4 @@
-"""Ray queries: distances, barycentric weights and visibility of shapes with analytic answers."""
+"""Cast rays at shapes with analytic distances, barycentric weights and visibility."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_miss_has_infinite_distance_and_no_weights():
     assert hits.face_idx[0] == -1
     assert np.isinf(hits.distance[0])
     assert not hits.barycentric.any()
-    assert not hits.found[0]
+    assert not hits.is_hit[0]
 
 
 def test_a_face_is_hit_from_behind_too():
@@ -54,7 +54,7 @@ def test_hit_points_agree_with_weights_over_many_chunks():
     origins = rng.normal(size=(200_000, 3)) * 4
     directions = rng.normal(size=origins.shape) - origins
     hits = caster.first_hit(origins, directions)
-    hit = hits.found
+    hit = hits.is_hit
     assert 0.1 < hit.mean() < 1
     along = origins[hit] + directions[hit] * hits.distance[hit, None]
     inside = np.einsum("nij,ni->nj", vertices[faces[hits.face_idx[hit]]], hits.barycentric[hit])

@@ -1,4 +1,4 @@
-"""Repair: a sound mesh passes unchanged, a broken one becomes manifold, a hopeless one is refused."""
+"""Repair meshes: a sound one passes unchanged, a broken one becomes manifold, a hopeless one is refused."""
 
 import numpy as np
 import pytest
@@ -11,12 +11,12 @@ from tests.geometry.solids import cube, joined, plane, sphere, volume
 
 
 def soup_of(vertices: np.ndarray, faces: np.ndarray) -> TriMesh:
-    """The same triangles, with three vertices each."""
+    """Give each triangle three vertices that no other triangle shares."""
     return TriMesh(vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3))
 
 
 def cubes_sharing_corners(shift: tuple[float, float, float]) -> TriMesh:
-    """Two cubes, the second moved by `shift`, with one vertex where two corners coincide."""
+    """Make two cubes, the second moved by `shift`, that share a vertex where two corners coincide."""
     vertices, faces = joined(cube(), (cube()[0] + shift, cube()[1]))
     _, first, inverse = np.unique(vertices.round(6), axis=0, return_index=True, return_inverse=True)
     return TriMesh(vertices, first[inverse.ravel()][faces])

@@ -1,4 +1,4 @@
-"""Dihedral angles, and bevels of marching cubes that become creases."""
+"""Measure dihedral angles, and turn the bevels of marching cubes into creases."""
 
 import numpy as np
 import pytest

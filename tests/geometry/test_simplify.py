@@ -1,4 +1,4 @@
-"""Simplification: the count of triangles, the reported error, and what happens where a child process fails."""
+"""Simplify meshes: the count of triangles, the reported error, and what happens where a child process fails."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.geometry.solids import assembly, bored_box, cube, joined, plane, quad
 
 
 def fine_cube(rounds: int = 6) -> TriMesh:
-    """A cube whose sides are cut into many triangles."""
+    """Make a cube whose sides are cut into many triangles."""
     vertices, quads = quad_cube(rounds)
     return TriMesh(vertices, np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]]))
 
@@ -120,12 +120,12 @@ def test_curved_and_axis_aligned_surfaces_are_not_moved(solid):
 
 
 def nearest_to_corner(vertices: np.ndarray) -> float:
-    """Distance of the nearest vertex to a corner of the bored box."""
+    """Measure the distance of the nearest vertex to a corner of the bored box."""
     return np.linalg.norm(vertices - [0.8, 0.6, 0.5], axis=1).min()
 
 
 def restores_creases(arguments: tuple) -> bool:
-    """Whether arguments of begin() ask the child to restore creases."""
+    """Tell whether arguments of begin() ask the child to restore creases."""
     return arguments[-1] > 0
 
 

@@ -1,4 +1,4 @@
-"""MikkTSpace frames on shapes whose texture axes are known."""
+"""Compute MikkTSpace frames on shapes whose texture axes are known."""
 
 import numpy as np
 
@@ -7,7 +7,10 @@ from gdtool.geometry.tangents import corner_tangents, decode_tangent_space, enco
 
 
 def plane(n=4, turned=0.0):
-    """A square in the plane z = 0 facing +Z; image right is +X and image up is +Y when turned is 0 (radians)."""
+    """Make a square in the plane z = 0 that faces +Z; turned: rotation of its texture in radians.
+
+    With 0 image right is +X and image up is +Y.
+    """
     axis = np.linspace(0, 1, n)
     x, y = np.meshgrid(axis, axis)
     vertices = np.stack([x, y, 0 * x], -1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Edges, pieces, handles, and whether a mesh is closed and manifold, from its indices."""
+"""Find edges, pieces and handles from indices, and whether a mesh is closed and manifold."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Rows grouped by their hashes are those that np.unique groups."""
+"""Group rows by their hashes as np.unique groups them."""
 
 import numpy as np
 import pytest

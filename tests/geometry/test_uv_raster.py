@@ -1,4 +1,7 @@
-"""Each texel has one owner, also where a vertex or an edge lies on its centre; compared with rational arithmetic."""
+"""Check that each texel has one owner, also where a vertex or an edge lies on its centre.
+
+The expected owners are computed in rational arithmetic.
+"""
 
 from fractions import Fraction
 
@@ -17,7 +20,7 @@ from gdtool.geometry.uv_raster import (
 
 
 def grid(n: int, low: float, high: float, jitter: float = 0.0, seed: int = 0):
-    """Triangles over [low, high]² with n x n vertices; the rim stays straight."""
+    """Make triangles over [low, high]² with n x n vertices; jitter moves inner vertices only."""
     rng = np.random.default_rng(seed)
     axis = np.linspace(low, high, n)
     uv = np.stack(np.meshgrid(axis, axis), -1)

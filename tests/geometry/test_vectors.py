@@ -1,4 +1,4 @@
-"""Products of vectors stored coordinate by coordinate agree with numpy."""
+"""Compare products of vectors stored coordinate by coordinate with numpy's."""
 
 import numpy as np
 

@@ -14,14 +14,14 @@ def test_srgb_known_values():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_srgb_there_and_back(dtype):
+def test_srgb_round_trip(dtype):
     x = np.linspace(0, 1, 4097, dtype=dtype)
     back = linear_from_srgb(srgb_from_linear(x))
     assert back.dtype == dtype
     np.testing.assert_allclose(back, x, atol=3e-7 if dtype == np.float32 else 2e-8)
 
 
-def test_eight_bit_codes_survive():
+def test_eight_bit_codes_round_trip():
     codes = np.arange(256, dtype=np.uint8)
     linear = linear_from_srgb(codes)
     assert linear.dtype == np.float32
@@ -29,7 +29,7 @@ def test_eight_bit_codes_survive():
     np.testing.assert_array_equal(np.rint(srgb_from_linear(linear) * 255), codes)
 
 
-def test_normals_there_and_back():
+def test_normals_round_trip():
     n = np.random.default_rng(0).normal(size=(1000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     stored = np.rint(encode_normal(n) * 65535).astype(np.uint16)

@@ -6,7 +6,7 @@ import pytest
 from gdtool.images.contact import contact_sheet
 
 
-def test_cells_stand_where_their_row_and_column_say():
+def test_cells_stand_at_their_row_and_column():
     red, clear = np.zeros((40, 40, 3)), np.zeros((40, 40, 4))
     red[..., 0] = 1
     sheet = contact_sheet([[red, None], [clear, np.full((20, 40), 0.5)]])

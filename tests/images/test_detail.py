@@ -1,4 +1,4 @@
-"""Means, gains and guided filtering over the covered part of a picture."""
+"""Compute means, gains and guided filters over the covered part of a picture."""
 
 import numpy as np
 import pytest
@@ -22,10 +22,10 @@ def test_masked_mean_leaves_out_uncovered_pixels(disc):
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0, 1.5])
 def test_detail_gain_is_the_share_of_common_detail(disc, share):
     rng = np.random.default_rng(0)
-    one = rng.normal(0, 1, (SIZE, SIZE, 3))
+    picture = rng.normal(0, 1, (SIZE, SIZE, 3))
     y, x = np.mgrid[:SIZE, :SIZE] / SIZE
-    other = share * one + (x + y)[..., None]  # a slope is no detail
-    np.testing.assert_allclose(detail_gain(one, other, disc)[disc > 0], share, atol=0.02)
+    second = share * picture + (x + y)[..., None]  # a slope is no detail
+    np.testing.assert_allclose(detail_gain(picture, second, disc)[disc > 0], share, atol=0.02)
 
 
 def test_guided_keeps_values_linear_in_the_guide_and_smooths_others(disc):

@@ -34,7 +34,7 @@ def save(path, image: np.ndarray, **attributes) -> None:
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_png_comes_back_as_it_was_written(tmp_path, channels, dtype):
+def test_png_is_read_as_written(tmp_path, channels, dtype):
     image = np.random.default_rng(1).integers(0, np.iinfo(dtype).max + 1, (20, 31, channels)).astype(dtype)
     write_png(tmp_path / "x.png", image)
     back = read_image(tmp_path / "x.png")
@@ -268,14 +268,14 @@ def test_names_that_are_not_utf8(tmp_path, picture):
     np.testing.assert_array_equal(read_image(path), picture)
 
 
-def test_a_place_that_cannot_be_written(tmp_path):
+def test_a_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError):
         write_png(tmp_path / "file" / "x.png", np.zeros((4, 4)))
 
 
 @pytest.mark.parametrize("writer", ["write_png", "write_exr"])
-def test_a_full_disk_is_told(tmp_path, writer):
+def test_a_full_disk_is_reported(tmp_path, writer):
     code = f"""
 import resource, signal, sys
 import numpy as np

@@ -69,7 +69,7 @@ def test_opaque_alpha_is_segmented():
     assert overlap(foreground(np.dstack([image, np.full(image.shape[:2], 255, np.uint8)])), truth) > 0.95
 
 
-def test_a_given_mask_comes_before_everything():
+def test_a_mask_argument_comes_first():
     image, _ = scene()
     mask = np.zeros(image.shape[:2], np.uint8)
     mask[10:20, 10:20] = 255
@@ -107,14 +107,14 @@ def busy_scene(size: int = 320, contrast: float = 1.0):
 
 def test_a_busy_background_is_removed_with_a_warning_or_refused():
     image, truth = busy_scene()
-    told = []
-    mask = foreground(image, None, "leaf.png", told.append)
+    warned = []
+    mask = foreground(image, None, "leaf.png", warned.append)
     assert mask.dtype == np.float32
     assert overlap(mask, truth) > 0.95
-    assert len(told) == 1
-    assert told[0].startswith("leaf.png: the background is not plain")
-    foreground(scene()[0], None, "plain.png", told.append)
-    assert len(told) == 1
+    assert len(warned) == 1
+    assert warned[0].startswith("leaf.png: the background is not plain")
+    foreground(scene()[0], None, "plain.png", warned.append)
+    assert len(warned) == 1
     np.testing.assert_array_equal(mask, foreground(image))  # the same every time
     hidden, _ = busy_scene(contrast=0.0)
     with pytest.raises(InputError, match="do not tell the subject from it"):

@@ -37,11 +37,11 @@ def network(tmp_path):
 
 def test_a_network_cuts_out_what_it_finds_on_any_background(network):
     image, truth = busy_scene(size=480)
-    told = []
-    mask = foreground(image, None, "leaf.png", told.append, network)
+    warned = []
+    mask = foreground(image, None, "leaf.png", warned.append, network)
     assert mask.shape == truth.shape
     assert mask.dtype == np.float32
-    assert not told
+    assert not warned
     assert overlap(mask, truth) > 0.97
 
 
@@ -53,7 +53,7 @@ def test_a_mask_and_alpha_come_before_the_network(network):
     np.testing.assert_array_equal(foreground(image, alpha, network=network), alpha / 255)
 
 
-def test_a_network_that_finds_nothing_is_told(network):
+def test_a_network_that_finds_nothing_is_an_error(network):
     with pytest.raises(InputError, match=r"red\.onnx: finds nothing"):
         foreground(np.full((100, 100, 3), 120, np.uint8), subject="grey.png", network=network)
 

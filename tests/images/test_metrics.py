@@ -55,18 +55,18 @@ def test_color_protocols():
     mask = np.zeros((1, 256, 256), np.float32)
     mask[:, 64:192, 64:192] = 1  # a quarter of the frame
     a, b = (linear_from_srgb(np.full((1, 256, 256, 3), value)) * mask[..., None] for value in (0.5, 0.6))
-    found = metrics.color_metrics(a, mask, b, mask)
-    assert found["psnr_masked"] == pytest.approx(20, abs=1e-3)
-    assert found["psnr_published"] == pytest.approx(20 + 10 * np.log10(4), abs=1e-3)
-    assert found["ssim_published"] > found["ssim_masked"]
+    figures = metrics.color_metrics(a, mask, b, mask)
+    assert figures["psnr_masked"] == pytest.approx(20, abs=1e-3)
+    assert figures["psnr_published"] == pytest.approx(20 + 10 * np.log10(4), abs=1e-3)
+    assert figures["ssim_published"] > figures["ssim_masked"]
 
 
 def test_a_missing_object_is_black_in_the_mask_and_white_in_the_frame():
     mask = np.ones((1, 256, 256), np.float32)
     white = np.ones((1, 256, 256, 3), np.float32)
-    found = metrics.color_metrics(white * 0, mask * 0, white, mask)
-    assert found["psnr_masked"] == pytest.approx(0, abs=1e-5)
-    assert found["psnr_published"] == 100
+    figures = metrics.color_metrics(white * 0, mask * 0, white, mask)
+    assert figures["psnr_masked"] == pytest.approx(0, abs=1e-5)
+    assert figures["psnr_published"] == 100
 
 
 def test_psnr_is_of_each_picture_and_then_the_mean():
@@ -115,8 +115,8 @@ def test_views_metrics_take_the_domains_that_both_have():
         "roughness": noise((1, 256, 256)),
         "depth": noise((1, 256, 256)),
     }
-    found = metrics.views_metrics(images, mask, {k: v for k, v in images.items() if k != "depth"}, mask)
-    assert found == pytest.approx(
+    figures = metrics.views_metrics(images, mask, {k: v for k, v in images.items() if k != "depth"}, mask)
+    assert figures == pytest.approx(
         {
             "mask_iou": 1,
             "color_psnr_published": 100,

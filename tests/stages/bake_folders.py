@@ -56,7 +56,7 @@ def torus_views(size: int = 96) -> Views:
     for camera in cameras:
         origins, directions = rays(camera)
         hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
-        seen = hits.found.reshape(size, size)
+        seen = hits.is_hit.reshape(size, size)
         at = np.einsum("nk,nkc->nc", hits.barycentric, vertices[faces[hits.face_idx]])
         normal = np.einsum("nk,nkc->nc", hits.barycentric, normals[faces[hits.face_idx]])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)

@@ -39,7 +39,7 @@ def rendered_albedo(asset: Path, views: Views | None = None, facing: float = 0.0
         origins, directions = rays(camera)
         hits = caster.first_hit(origins.reshape(-1, 3), directions.reshape(-1, 3))
         both = (
-            hits.found
+            hits.is_hit
             & (views.mask[k].ravel() > 0)
             & (views.images["normal"][k].reshape(-1, 3) @ camera.backward >= facing)
         )
@@ -60,9 +60,9 @@ def test_writes_a_folder_that_validates_and_skips_the_second_time(gdtool, chain,
     assert content.factors["base_color"] == (1, 1, 1, 1)
     assert content.report["materials_from"].startswith("views: albedo")
     before = (tmp_path / "out" / "asset.glb").read_bytes()
-    again = gdtool("bake", chain, *FAST, "-o", "out")
-    assert again.returncode == 0
-    assert "up to date" in again.stderr
+    second_run = gdtool("bake", chain, *FAST, "-o", "out")
+    assert second_run.returncode == 0
+    assert "up to date" in second_run.stderr
     other = gdtool("bake", chain, *FAST, "-o", "twin")
     assert other.returncode == 0
     assert (tmp_path / "twin" / "asset.glb").read_bytes() == before
@@ -92,22 +92,27 @@ def test_a_picture_finer_than_its_view_is_baked(gdtool, tmp_path):
         * np.float32([1, 0.8, 0.6])
     )
     images, mask = resized_views({**fine.images, "albedo": striped}, fine.mask, 96, 96)
-    for way in ("plain", "pictured"):
-        folder = tmp_path / way
+    for atlas_kind in ("plain", "pictured"):
+        folder = tmp_path / atlas_kind
         out = fresh(folder)
-        if way == "pictured":
+        if atlas_kind == "pictured":
             write_png(
                 out.path("picture.png"), np.concatenate([srgb_from_linear(striped[0]), fine.mask[0][..., None]], -1)
             )
-        write_views(out, Views(rig("six", 96), images, mask), picture="front" if way == "pictured" else "")
+        write_views(out, Views(rig("six", 96), images, mask), picture="front" if atlas_kind == "pictured" else "")
         finish(folder, "views", out.content, {})
-        done = gdtool("bake", atlas, "--size", 512, "--no-ao", "--views", folder, "-o", f"from_{way}")
+        done = gdtool("bake", atlas, "--size", 512, "--no-ao", "--views", folder, "-o", f"from_{atlas_kind}")
         assert done.returncode == 0, done.stderr
     assert gdtool("validate", tmp_path / "pictured").returncode == 0
     front = Views(fine.cameras[:1], {"albedo": striped[:1], "normal": fine.images["normal"][:1]}, fine.mask[:1])
-    plain, pictured = (rendered_albedo(tmp_path / f"from_{way}", front, facing=0.8) for way in ("plain", "pictured"))
+    plain, pictured = (
+        rendered_albedo(tmp_path / f"from_{atlas_kind}", front, facing=0.8) for atlas_kind in ("plain", "pictured")
+    )
     assert pictured > plain + 3
-    report = [open_folder(tmp_path / f"from_{way}").content.report["materials_from"] for way in ("plain", "pictured")]
+    report = [
+        open_folder(tmp_path / f"from_{atlas_kind}").content.report["materials_from"]
+        for atlas_kind in ("plain", "pictured")
+    ]
     assert ["picture" in text for text in report] == [False, True]
     skipped = {skip.what: skip.reason for skip in open_folder(tmp_path / "from_plain").manifest.skipped}
     assert skipped["picture"] == "the views' folder holds none"
@@ -156,10 +161,10 @@ def test_source_frame_undoes_the_normalisation(gdtool, tmp_path):
     assert gdtool("bake", atlas, *FAST, "--no-ao", "-o", "own").returncode == 0
     done = gdtool("bake", atlas, *FAST, "--no-ao", "--source-frame", "-o", "source")
     assert done.returncode == 0, done.stderr
-    own, source = (load_scene(tmp_path / one / "asset.glb") for one in ("own", "source"))
+    normalised, source = (load_scene(tmp_path / one / "asset.glb") for one in ("own", "source"))
     matrix = np.array(turn, float)
-    np.testing.assert_allclose(source.vertices, own.vertices @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-4)
-    np.testing.assert_allclose(source.normals, own.normals @ matrix[:3, :3].T / 10, atol=1e-5)
+    np.testing.assert_allclose(source.vertices, normalised.vertices @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(source.normals, normalised.normals @ matrix[:3, :3].T / 10, atol=1e-5)
     assert open_folder(tmp_path / "source").content.frame == "source"
 
 
@@ -207,7 +212,7 @@ def test_maps_that_do_not_fit_are_refused_with_the_figure(monkeypatch):
         require_map_memory("ring", 4096)
 
 
-def test_broken_faces_do_not_stop_it(gdtool, chain, tmp_path):
+def test_broken_faces_do_not_stop_the_bake(gdtool, chain, tmp_path):
     mesh = torus_atlas()
     faces, uvs = mesh.faces.copy(), mesh.face_uvs.copy()
     faces[3, 1] = faces[3, 0]  # two corners in one place
@@ -254,7 +259,7 @@ def test_bad_input_exits_with_one_line(gdtool, chain, tmp_path, fault, code, mes
     assert not (tmp_path / "low.asset" / "asset").exists()
 
 
-def test_overlapping_texture_coordinates_are_told(gdtool, chain, tmp_path):
+def test_overlapping_texture_coordinates_are_reported(gdtool, chain, tmp_path):
     mesh = torus_atlas()
     half = len(mesh.faces) // 2
     folded = mesh.face_uvs.copy()
@@ -331,7 +336,7 @@ def test_size_follows_the_detail_of_the_source(gdtool, chain, tmp_path):
     assert open_folder(tmp_path / "second").content.size == 1024
 
 
-def test_emission_comes_along(gdtool, chain, tmp_path):
+def test_emission_is_baked(gdtool, chain, tmp_path):
     from dataclasses import replace
 
     from gdtool.assets.gltf.write import write_glb

@@ -1,5 +1,4 @@
-"""bake on meshes that break others: thin walls, mirrored and missing texture area, one face, tiny and huge
-coordinates."""
+"""Bake meshes that are hard: thin walls, mirrored and missing texture area, one face, tiny and huge coordinates."""
 
 import json
 from pathlib import Path
@@ -115,7 +114,7 @@ def test_one_face_is_enough(gdtool):
     assert folder.content.lods == () or all((folder.path / name).exists() for name in folder.content.lods)
 
 
-def test_a_source_inside_out_is_turned_and_told(gdtool):
+def test_a_source_inside_out_is_turned_with_a_warning(gdtool):
     vertices, quads, uv, corners = slab(0.3)
     scene = colored(vertices, quads[:, ::-1], uv.reshape(6, 4, 2)[:, ::-1].reshape(-1, 2), corners, COLORS)
     image, folder, done = bake(gdtool, QuadMesh(vertices, quads, uv, corners), scene)

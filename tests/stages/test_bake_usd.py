@@ -44,8 +44,8 @@ def test_geometry_and_material_are_the_assets(gdtool, chain, tmp_path, conventio
     assert (counts == np.where(obj.is_quad, 4, 3)).all()
     assert (counts == 4).sum() > 500
     st = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
-    own = obj.uv[obj.face_uvs[obj.face_uvs >= 0]]
-    np.testing.assert_allclose(np.array(st.ComputeFlattened()) * [1, -1] + [0, 1], own, atol=1e-6)
+    obj_uv = obj.uv[obj.face_uvs[obj.face_uvs >= 0]]
+    np.testing.assert_allclose(np.array(st.ComputeFlattened()) * [1, -1] + [0, 1], obj_uv, atol=1e-6)
     normals = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals").ComputeFlattened())
     points = np.array(mesh.GetPointsAttr().Get())[mesh.GetFaceVertexIndicesAttr().Get()]
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])

@@ -41,10 +41,10 @@ def egg_views(vertices, faces, size=48):
     renderer, cameras = Renderer(scene), rig("six", size)
     buffers = [renderer.buffers(camera) for camera in cameras]
     images = {
-        name: np.stack([one[name] for one in buffers])
+        name: np.stack([buffer[name] for buffer in buffers])
         for name in ("normal", "depth", "albedo", "roughness", "metallic")
     }
-    mask = np.stack([one["mask"] for one in buffers])
+    mask = np.stack([buffer["mask"] for buffer in buffers])
     return Views(cameras, {"color": images["albedo"], **images}, mask)
 
 
@@ -84,37 +84,37 @@ def chain(tmp_path):
 
 def measured(result, reference=None, **options):
     """Call the stage in this process, since a command takes seconds to start; test_the_command runs the command."""
-    found, against = (
+    figures, against = (
         None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference)
     )
-    return evaluate.evaluate(found, against, evaluate.Options(**{"samples": 2000, "syncdreamer": False, **options}))
+    return evaluate.evaluate(figures, against, evaluate.Options(**{"samples": 2000, "syncdreamer": False, **options}))
 
 
 def test_the_truth_and_the_views_are_found_along_the_provenance(chain):
-    found = measured(chain / "surface")
-    assert all(isinstance(value, (bool, int, float, str)) for value in found.values())  # flat
-    assert found["result"] == "egg"
-    assert found["kind"] == "surface"
-    assert found["watertight"]
-    assert found["reference_watertight"]
-    assert found["vertices"] == len(egg()[0])
-    assert found["faces"] == len(egg()[1])
-    assert found["quads"] == 0
+    figures = measured(chain / "surface")
+    assert all(isinstance(value, (bool, int, float, str)) for value in figures.values())  # flat
+    assert figures["result"] == "egg"
+    assert figures["kind"] == "surface"
+    assert figures["watertight"]
+    assert figures["reference_watertight"]
+    assert figures["vertices"] == len(egg()[0])
+    assert figures["faces"] == len(egg()[1])
+    assert figures["quads"] == 0
     # 5 % of a radius of 0.3 to 0.5, some less along the normal: the frame of the model was undone.
-    assert 0.014 < found["surface_distance"] < 0.025
-    assert found["surface_iou"] == pytest.approx(0.95**3, abs=0.01)
-    assert found["surface_normal_degrees"] < 3
-    assert found["surface_flipped_share"] == 0
-    assert found["seen_distance"] == pytest.approx(found["surface_distance"], rel=0.1)
-    assert 0.8 < found["seen_share"] <= 1
+    assert 0.014 < figures["surface_distance"] < 0.025
+    assert figures["surface_iou"] == pytest.approx(0.95**3, abs=0.01)
+    assert figures["surface_normal_degrees"] < 3
+    assert figures["surface_flipped_share"] == 0
+    assert figures["seen_distance"] == pytest.approx(figures["surface_distance"], rel=0.1)
+    assert 0.8 < figures["seen_share"] <= 1
 
 
 def test_a_surface_is_rendered_through_the_cameras_of_its_views(chain):
-    found = measured(chain / "surface")
-    assert found["views"] == 6
-    assert found["reference_views"] == "egg"
-    assert found["mask_iou"] == pytest.approx(0.95**2, abs=0.01)
-    assert found["depth_error"] == pytest.approx(0.02, abs=0.01)
+    figures = measured(chain / "surface")
+    assert figures["views"] == 6
+    assert figures["reference_views"] == "egg"
+    assert figures["mask_iou"] == pytest.approx(0.95**2, abs=0.01)
+    assert figures["depth_error"] == pytest.approx(0.02, abs=0.01)
     true_size = write_egg_surface(chain / "exact", {"source": chain / "views"})
     exact = measured(true_size)
     assert exact["mask_iou"] > 0.999
@@ -140,15 +140,15 @@ def test_views_named_as_the_reference_come_before_those_along_the_provenance(cha
 
 def test_every_kind_of_reference_is_accepted(chain, tmp_path):
     surface = chain / "surface"
-    own = measured(surface)
+    without_views = measured(surface)
     by_file = measured(surface, tmp_path / "egg.obj")
-    assert by_file["surface_distance"] == own["surface_distance"]
+    assert by_file["surface_distance"] == without_views["surface_distance"]
     by_views = measured(surface, chain / "views")
-    assert by_views["surface_distance"] == own["surface_distance"]
+    assert by_views["surface_distance"] == without_views["surface_distance"]
     exact = write_egg_surface(chain / "exact", {})
     by_surface = measured(surface, exact)
     # surface.ply is float32: the samples fall on the same points but for rounding
-    assert by_surface["surface_distance"] == pytest.approx(own["surface_distance"], rel=1e-3)
+    assert by_surface["surface_distance"] == pytest.approx(without_views["surface_distance"], rel=1e-3)
     by_box = measured(exact, tmp_path / "egg.obj", frame="box")
     assert by_box["surface_distance"] < 1e-5
     assert by_box["surface_f_score"] == 1
@@ -166,9 +166,9 @@ def test_views_that_carry_their_model_are_a_reference(chain, tmp_path):
     write_views(out, read_views(open_folder(chain / "views")), source_from_world=MATRIX, model=True)
     write_glb(out.path("source.glb"), Scene(vertices, faces))
     finish(tmp_path / "carrying", "views", out.content, {})
-    found = measured(write_egg_surface(chain / "exact", {}), tmp_path / "carrying", render=False)
-    assert found["surface_distance"] < 1e-5
-    assert "seen_distance" in found
+    figures = measured(write_egg_surface(chain / "exact", {}), tmp_path / "carrying", render=False)
+    assert figures["surface_distance"] < 1e-5
+    assert "seen_distance" in figures
 
 
 def test_a_result_from_a_picture_is_measured_in_the_unit_box(chain, tmp_path):
@@ -190,26 +190,26 @@ def test_a_quad_mesh_is_measured_with_its_seen_part(chain):
         vertices=8, quads=6, triangles=0, watertight=True, source_from_world=tuple(map(float, MATRIX.ravel()))
     )
     finish(chain / "mesh", "mesh", content, {"source": chain / "surface"})
-    found = measured(chain / "mesh")
-    assert (found["vertices"], found["quads"], found["faces"]) == (8, 6, 6)
-    assert found["watertight"]
-    assert found["surface_flipped_share"] == pytest.approx(0, abs=0.02)
-    assert found["surface_iou"] == pytest.approx(np.pi / 6 * 1.1**3 / 1.1**3, abs=0.02)  # an ellipsoid in its box
-    assert "seen_distance" in found
-    assert "albedo_psnr_masked" not in found  # a bare mesh has nothing to render
-    found = measured(chain / "mesh", chain / "surface")
-    assert found["surface_accuracy"] > 0.05
+    figures = measured(chain / "mesh")
+    assert (figures["vertices"], figures["quads"], figures["faces"]) == (8, 6, 6)
+    assert figures["watertight"]
+    assert figures["surface_flipped_share"] == pytest.approx(0, abs=0.02)
+    assert figures["surface_iou"] == pytest.approx(np.pi / 6 * 1.1**3 / 1.1**3, abs=0.02)  # an ellipsoid in its box
+    assert "seen_distance" in figures
+    assert "albedo_psnr_masked" not in figures  # a bare mesh has nothing to render
+    figures = measured(chain / "mesh", chain / "surface")
+    assert figures["surface_accuracy"] > 0.05
 
 
 def test_files_against_files_and_a_hole(tmp_path):
     vertices, faces = egg()
     trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "a.ply")
     trimesh.Trimesh(vertices, faces[5:], process=False).export(tmp_path / "b.ply")
-    found = measured("b.ply", "a.ply")
-    assert not found["watertight"]
-    assert found["reference_watertight"]
-    assert found["faces"] == len(faces) - 5
-    assert found["surface_accuracy"] < 1e-6 < found["surface_completeness"]
+    figures = measured("b.ply", "a.ply")
+    assert not figures["watertight"]
+    assert figures["reference_watertight"]
+    assert figures["faces"] == len(faces) - 5
+    assert figures["surface_accuracy"] < 1e-6 < figures["surface_completeness"]
     back = measured("a.ply", "b.ply")
     assert "surface_iou" not in back
     assert not back["reference_watertight"]
@@ -228,27 +228,27 @@ def test_views_against_views(chain, tmp_path):
     images["depth"] = images["depth"] + 0.01 * (truth.mask > 0)
     del images["metallic"]
     other = shifted(truth, tmp_path / "other", images=images)
-    found = measured(other, chain / "views")
-    assert found["kind"] == "views"
-    assert found["views"] == 6
-    assert found["mask_iou"] == 1
+    figures = measured(other, chain / "views")
+    assert figures["kind"] == "views"
+    assert figures["views"] == 6
+    assert figures["mask_iou"] == 1
     for name in ("color_psnr_published", "color_psnr_masked", "albedo_psnr_masked"):
-        assert found[name] == 100, name
-    assert found["color_ssim_published"] == pytest.approx(1)
-    assert found["normal_degrees"] < 0.01
-    assert found["roughness_error"] == pytest.approx(0.2, abs=0.003)
-    assert found["depth_error"] == pytest.approx(0.01, abs=1e-5)
-    assert "metallic_error" not in found
-    assert "surface_distance" not in found
+        assert figures[name] == 100, name
+    assert figures["color_ssim_published"] == pytest.approx(1)
+    assert figures["normal_degrees"] < 0.01
+    assert figures["roughness_error"] == pytest.approx(0.2, abs=0.003)
+    assert figures["depth_error"] == pytest.approx(0.01, abs=1e-5)
+    assert "metallic_error" not in figures
+    assert "surface_distance" not in figures
 
 
 def test_views_of_another_size_and_of_other_cameras(chain, tmp_path):
     vertices, faces = egg()
     large = shifted(egg_views(vertices, faces, 96), tmp_path / "large")
-    found = measured(large, chain / "views")
-    assert found["mask_iou"] > 0.99
-    assert found["normal_degrees"] < 1
-    assert found["color_psnr_masked"] > 45
+    figures = measured(large, chain / "views")
+    assert figures["mask_iou"] > 0.99
+    assert figures["normal_degrees"] < 1
+    assert figures["color_psnr_masked"] > 45
     turned = shifted(
         replace(egg_views(vertices, faces), cameras=[replace(c, half_width=0.5) for c in rig("six", 48)]),
         tmp_path / "turned",
@@ -264,8 +264,8 @@ def test_renders_against_renders(tmp_path):
         frame[..., 3] = 255
         write_png(out.path("000.png"), frame)
         finish(tmp_path / name, "renders", RendersContent(frames=1, environment="mid", light="mid"), {})
-    found = measured("a", "b")
-    assert found["color_psnr_masked"] == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
+    figures = measured("a", "b")
+    assert figures["color_psnr_masked"] == pytest.approx(-20 * np.log10(26 / 255), abs=0.01)
 
 
 def test_results_that_cannot_be_compared_are_refused(chain, tmp_path):
@@ -279,15 +279,15 @@ def test_results_that_cannot_be_compared_are_refused(chain, tmp_path):
 
 def test_the_command(gdtool, chain):
     """One flat JSON object with both protocols, the same each time; a table; bad ones among many."""
-    one, two = (gdtool("evaluate", chain / "surface", "--json", "--samples", 500) for _ in range(2))
-    assert one.returncode == 0
-    assert one.stdout == two.stdout
-    assert one.stderr == ""
-    found = json.loads(one.stdout)
-    assert found["syncdreamer_chamfer"] > 0
-    assert found["surface_distance"] > 0
-    assert found["path"] == str(chain / "surface")
-    assert all(isinstance(value, (bool, int, float, str)) for value in found.values())
+    first, second = (gdtool("evaluate", chain / "surface", "--json", "--samples", 500) for _ in range(2))
+    assert first.returncode == 0
+    assert first.stdout == second.stdout
+    assert first.stderr == ""
+    figures = json.loads(first.stdout)
+    assert figures["syncdreamer_chamfer"] > 0
+    assert figures["surface_distance"] > 0
+    assert figures["path"] == str(chain / "surface")
+    assert all(isinstance(value, (bool, int, float, str)) for value in figures.values())
 
     done = gdtool("evaluate", "--samples", 500, "--no-syncdreamer", stdin=f"{chain / 'surface'}\n{chain / 'nothing'}\n")
     assert done.returncode == 1

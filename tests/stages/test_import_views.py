@@ -121,10 +121,10 @@ def test_nerf_world_is_turned_scaled_and_centred(gdtool, nerf):
     assert views.content.domains == ("color",)
     m = np.array(back).reshape(4, 4)
     source = surface.vertices @ m[:3, :3].T + m[:3, 3]
-    own = (source - (3, 1, -2)) / 2  # the inverse of what the fixture did, Z up
-    own = np.stack([own[:, 0], own[:, 2], -own[:, 1]], -1)
+    in_fixture_frame = (source - (3, 1, -2)) / 2  # the inverse of what the fixture did, Z up
+    in_fixture_frame = np.stack([in_fixture_frame[:, 0], in_fixture_frame[:, 2], -in_fixture_frame[:, 1]], -1)
     # Silhouettes alone: a hull, around the solid.
-    assert np.abs(lopsided(own)).mean() < 0.03
+    assert np.abs(lopsided(in_fixture_frame)).mean() < 0.03
     assert np.abs(surface.vertices.max(0) + surface.vertices.min(0)).max() < 0.1
 
 

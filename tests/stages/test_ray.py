@@ -42,13 +42,13 @@ def test_sources_fan_out_and_bad_ones_are_reported(gdtool_here, address, tmp_pat
     assert "Traceback" not in done.stderr, done.stderr
     wanted = [f"data/{name}.asset/views" for name in "abdef"]
     assert sorted(done.stdout.splitlines()) == wanted
-    assert [one["path"] for one in json.loads((tmp_path / "data/manifest.json").read_text())["content"]["objects"]] == [
-        p[5:] for p in wanted
-    ]
+    assert [
+        entry["path"] for entry in json.loads((tmp_path / "data/manifest.json").read_text())["content"]["objects"]
+    ] == [p[5:] for p in wanted]
     # The same as without: the folders' digests do not know who made them.
-    again = gdtool_here("render-dataset", *sources, *fast)
-    assert again.returncode == 1
-    assert again.stderr.count("up to date") == 5
+    second_run = gdtool_here("render-dataset", *sources, *fast)
+    assert second_run.returncode == 1
+    assert second_run.stderr.count("up to date") == 5
     assert gdtool_here("render-dataset", "a.obj", *FAST, "--domains", "normal", "-o", "alone").returncode == 0
     alone, there = (
         json.loads((tmp_path / p / "manifest.json").read_text())["files"] for p in ("alone", "data/a.asset/views")

@@ -58,9 +58,9 @@ def test_writes_a_valid_surface_once(gdtool, folder, tmp_path):
     far = sure & (np.abs(surface.vertices[:, 0]) > 0.05)
     assert np.abs(surface.metallic - metallic)[far].mean() < 0.03
     assert gdtool("validate", out).returncode == 0
-    again = gdtool("reconstruct", folder)
-    assert again.returncode == 0
-    assert "up to date" in again.stderr
+    second_run = gdtool("reconstruct", folder)
+    assert second_run.returncode == 0
+    assert "up to date" in second_run.stderr
 
 
 def test_same_seed_gives_the_same_file(gdtool, folder, tmp_path):
@@ -107,7 +107,7 @@ def test_paper_method_without_depth_uses_depth_from_normals(gdtool, folder, tmp_
         "reconstruct", folder, "--method", "paper", "--steps", 30, "--resolution", 32, "--ignore", "depth", "-o", out
     )
     assert done.returncode == 0, done.stderr
-    skipped = {one["what"]: one["reason"] for one in manifest(out)["skipped"]}
+    skipped = {entry["what"]: entry["reason"] for entry in manifest(out)["skipped"]}
     assert skipped["volume start"] == "normal views say where the surface is"
     assert "matching of views" not in skipped
     assert manifest(out)["content"]["watertight"]
@@ -130,7 +130,7 @@ def test_normals_that_contradict_one_another_leave_the_silhouettes(gdtool, tmp_p
     assert {s["what"]: s["reason"] for s in record["skipped"]}[
         "surface by normals"
     ] == "the silhouettes alone give the shape"
-    assert method == "grid" or "volume start" not in {one["what"] for one in record["skipped"]}
+    assert method == "grid" or "volume start" not in {entry["what"] for entry in record["skipped"]}
     assert np.abs(read_surface(open_folder(out)).vertices).max() < 0.6
 
 

@@ -34,9 +34,9 @@ def test_obj_to_quads_in_its_normalised_frame(gdtool, tmp_path):
     assert matrix[:3, 3] == pytest.approx([5, 0, 0], abs=0.1)
     assert matrix[0, 0] == pytest.approx(160, rel=0.01)
     assert folder.content.report["distance_mean"] < 0.01
-    again = gdtool("remesh", "ball.obj", "--faces", 600)
-    assert again.stdout == run.stdout
-    assert "up to date" in again.stderr
+    second_run = gdtool("remesh", "ball.obj", "--faces", 600)
+    assert second_run.stdout == run.stdout
+    assert "up to date" in second_run.stderr
     stale = gdtool("remesh", "ball.obj", "--faces", 700)
     assert "600" in stale.stderr
     assert "700" in stale.stderr
@@ -46,10 +46,10 @@ def test_obj_to_quads_in_its_normalised_frame(gdtool, tmp_path):
 def test_triangles_only_decimates(gdtool, tmp_path):
     write_obj(tmp_path / "ball.obj", *sphere(24))
     assert gdtool("remesh", "ball.obj", "--triangles", 300).returncode == 0
-    found = content(tmp_path / "ball.asset/mesh")
-    assert found["quads"] == 0
-    assert 250 <= found["triangles"] <= 300
-    assert found["watertight"]
+    mesh_content = content(tmp_path / "ball.asset/mesh")
+    assert mesh_content["quads"] == 0
+    assert 250 <= mesh_content["triangles"] <= 300
+    assert mesh_content["watertight"]
 
 
 def test_a_mesh_that_meets_the_request_is_passed_through(gdtool, tmp_path):
@@ -60,23 +60,23 @@ def test_a_mesh_that_meets_the_request_is_passed_through(gdtool, tmp_path):
     run = gdtool("remesh", "ring.obj", "--faces", 800, "-v")
     assert run.returncode == 0
     assert "already is 800 quads" in run.stderr
-    found = content(tmp_path / "ring.asset/mesh")
-    assert found["engine"] == "passed through"
-    assert found["quads"] == 800
+    mesh_content = content(tmp_path / "ring.asset/mesh")
+    assert mesh_content["engine"] == "passed through"
+    assert mesh_content["quads"] == 800
 
 
 def test_broken_mesh_is_repaired_and_says_so(gdtool, tmp_path):
-    one, two = sphere(20, 0.4, (-0.5, 0, 0)), sphere(20, 0.4, (0.5, 0, 0))
-    vertices, faces = joined(one, two)
+    left, right = sphere(20, 0.4, (-0.5, 0, 0)), sphere(20, 0.4, (0.5, 0, 0))
+    vertices, faces = joined(left, right)
     faces = np.concatenate([faces, faces[:3], [[7, 7, 8]]])
     faces[10] = faces[10][::-1]
     write_obj(tmp_path / "two.obj", vertices, faces)
     run = gdtool("remesh", "two.obj", "--faces", 500)
     assert run.returncode == 0
     assert "duplicate faces" in run.stderr
-    found = content(tmp_path / "two.asset/mesh")
-    assert found["watertight"]
-    assert found["report"]["pieces"] == 2
+    mesh_content = content(tmp_path / "two.asset/mesh")
+    assert mesh_content["watertight"]
+    assert mesh_content["report"]["pieces"] == 2
 
 
 @pytest.mark.parametrize("scale", [1e-20, 1e20])
@@ -129,9 +129,9 @@ def test_symmetry_is_kept_when_asked(gdtool, tmp_path):
     vertices, faces = bored_box(48)
     write_obj(tmp_path / "box.obj", vertices, faces)
     assert gdtool("remesh", "box.obj", "--faces", 1500, "--symmetry", "z").returncode == 0
-    mesh, found = read_mesh(open_folder(tmp_path / "box.asset/mesh")), content(tmp_path / "box.asset/mesh")
-    assert found["report"]["symmetry"] == "z"
-    assert found["watertight"]
+    mesh, mesh_content = read_mesh(open_folder(tmp_path / "box.asset/mesh")), content(tmp_path / "box.asset/mesh")
+    assert mesh_content["report"]["symmetry"] == "z"
+    assert mesh_content["watertight"]
     assert abs(len(mesh.faces) / 1500 - 1) <= 0.03
     place = {tuple(point): i for i, point in enumerate(np.round(mesh.vertices, 6).tolist())}
     other = np.array([place[x, y, -z if z else 0.0] for x, y, z in np.round(mesh.vertices, 6).tolist()])
@@ -140,7 +140,7 @@ def test_symmetry_is_kept_when_asked(gdtool, tmp_path):
     assert 0 < (other == np.arange(len(other))).sum() < 200
 
 
-def test_symmetry_that_is_not_there_is_left_out_and_said(gdtool, tmp_path):
+def test_a_missing_symmetry_is_ignored_with_a_message(gdtool, tmp_path):
     vertices, faces = sphere(24)
     vertices[vertices[:, 0] > 0.3] *= [1.3, 1, 1]
     write_obj(tmp_path / "egg.obj", vertices, faces)

@@ -138,8 +138,8 @@ def test_turned_objects_look_as_from_a_turned_camera(gdtool, box, tmp_path):
         != manifest(tmp_path / "box-turned")["content"]["source_from_world"]
     )
     assert gdtool("render-dataset", "ball.glb", *FAST, "--cameras", "ball-turned", "-o", "again").returncode == 0
-    first, again = (read_views(open_folder(tmp_path / name)) for name in ("ball-turned", "again"))
-    np.testing.assert_array_equal(first.images["normal"], again.images["normal"])
+    first, second_run = (read_views(open_folder(tmp_path / name)) for name in ("ball-turned", "again"))
+    np.testing.assert_array_equal(first.images["normal"], second_run.images["normal"])
     assert (
         gdtool("render-dataset", "ball.glb", *FAST, "--cameras", "ball-turned", "--turn", "5", "-o", "no").returncode
         == 2
@@ -148,9 +148,9 @@ def test_turned_objects_look_as_from_a_turned_camera(gdtool, box, tmp_path):
 
 def test_second_run_is_up_to_date_and_same_seed_means_same_files(gdtool, box, tmp_path):
     assert gdtool("render-dataset", box, *FAST).returncode == 0
-    again = gdtool("render-dataset", box, *FAST)
-    assert again.returncode == 0
-    assert "up to date" in again.stderr
+    second_run = gdtool("render-dataset", box, *FAST)
+    assert second_run.returncode == 0
+    assert "up to date" in second_run.stderr
     assert gdtool("render-dataset", box, *FAST, "-o", "other").returncode == 0
     files = {p.relative_to(tmp_path / "other") for p in (tmp_path / "other").rglob("*") if p.is_file()} - {
         *map(type(box), ["manifest.json"])
@@ -195,8 +195,8 @@ def test_cameras_of_other_views_are_used_with_their_frame(gdtool, box, tmp_path)
     assert gdtool("render-dataset", box, *FAST, "--rig", "turntable", "--views", "3", "--fov", "40").returncode == 0
     views = tmp_path / "box.asset" / "views"
     # The same source again: the same pixels. Its normalised copy as another file: left where it is.
-    again = gdtool("render-dataset", box, "--cameras", views, *FAST, "-o", "again")
-    assert again.returncode == 0, again.stderr
+    second_run = gdtool("render-dataset", box, "--cameras", views, *FAST, "-o", "again")
+    assert second_run.returncode == 0, second_run.stderr
     matrix = np.array(manifest(views)["content"]["source_from_world"]).reshape(4, 4)
     lines = []
     for line in BOX.strip().splitlines():
@@ -252,7 +252,7 @@ def test_shards_share_the_sources_and_the_index(gdtool, box, tmp_path):
         assert gdtool("render-dataset", *sources, *fast, "--shard", wrong).returncode == 2
 
 
-def test_goes_on_after_a_kill(gdtool, box, tmp_path):
+def test_a_killed_run_goes_on(gdtool, box, tmp_path):
     """Killed while it renders the second of three: the first is kept, no half-written folder is left or listed."""
     for name in "abc":
         (tmp_path / f"{name}.obj").write_text(BOX)
@@ -263,9 +263,9 @@ def test_goes_on_after_a_kill(gdtool, box, tmp_path):
     process.wait()
     process.stdout.close()
     before = (tmp_path / "data/a.asset/views/manifest.json").read_bytes()
-    again = gdtool("render-dataset", *arguments)
-    assert again.returncode == 0, again.stderr
-    assert "a.asset/views: up to date" in again.stderr, again.stderr
+    second_run = gdtool("render-dataset", *arguments)
+    assert second_run.returncode == 0, second_run.stderr
+    assert "a.asset/views: up to date" in second_run.stderr, second_run.stderr
     assert (tmp_path / "data/a.asset/views/manifest.json").read_bytes() == before
     assert [one["path"] for one in manifest(tmp_path / "data")["content"]["objects"]] == [
         f"{name}.asset/views" for name in "abc"
@@ -333,7 +333,7 @@ def test_either_reflection_model(gdtool, box, tmp_path):
         assert difference.mean() < 0.1, domain
 
 
-def test_without_ray_or_its_cluster_that_is_said(gdtool, box, monkeypatch):
+def test_a_missing_ray_or_cluster_is_reported(gdtool, box, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     done = gdtool("render-dataset", box, *FAST, "--ray", "local")
     assert done.returncode == 5

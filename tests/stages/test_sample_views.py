@@ -68,24 +68,24 @@ def test_a_picture_becomes_six_views_in_six_domains(gdtool, picture, tiny_model,
     # The ball is 39 pixels of the picture wide and 11 of the views: what they were made of is kept four times as fine.
     record = json.loads((views / MANIFEST).read_text())
     assert record["content"]["picture"] == "front"
-    skipped = {one["what"] for one in record["skipped"]}
+    skipped = {entry["what"] for entry in record["skipped"]}
     assert (record["content"]["report"]["drawn_share"] > 0) != ("parts of the picture in the other views" in skipped)
     # Views that a model made of a picture: their surface is moved out by a fifth of a pixel.
     made = gdtool("reconstruct", views)
     assert made.returncode == 0, made.stderr
     surface = json.loads((tmp_path / "ball.asset/surface" / MANIFEST).read_text())
     assert surface["content"]["report"]["grown"] > 0
-    assert "growth of the surface" not in {one["what"] for one in surface["skipped"]}
+    assert "growth of the surface" not in {entry["what"] for entry in surface["skipped"]}
     assert (surface["content"]["report"]["restored_share"] > 0) != (
-        "parts that the picture alone shows" in {one["what"] for one in surface["skipped"]}
+        "parts that the picture alone shows" in {entry["what"] for entry in surface["skipped"]}
     )
     kept, shown = read_image(views / "picture.png"), read_image(views / "condition/000.png")
     assert kept.shape == (64, 64, 4)
     assert np.abs(kept[..., 3].reshape(16, 4, 16, 4).mean((1, 3)) - shown[..., 3]).mean() < 8
     assert gdtool("validate", views).returncode == 0
-    again = sample(gdtool, "ball.png", "--model", tiny_model)
-    assert "up to date" in again.stderr
-    assert again.stdout == "ball.asset/views\n"
+    second_run = sample(gdtool, "ball.png", "--model", tiny_model)
+    assert "up to date" in second_run.stderr
+    assert second_run.stdout == "ball.asset/views\n"
 
 
 def bytes_of(folder):
@@ -126,7 +126,7 @@ def test_a_compiled_network_gives_the_same(gdtool, picture, tiny_model, tmp_path
 
 
 @pytest.mark.slow
-def test_without_a_compiler_that_is_said(gdtool, picture, tiny_model, monkeypatch, tmp_path):
+def test_a_missing_compiler_is_reported(gdtool, picture, tiny_model, monkeypatch, tmp_path):
     monkeypatch.setenv("CXX", "/bin/false")
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path / "cache"))
     result = sample(gdtool, "ball.png", "--model", tiny_model, "--compile", "-o", "out")
@@ -226,7 +226,7 @@ def test_a_picture_unlike_the_training_is_sampled_with_a_warning(gdtool, picture
     assert "width over height of the subject is 1.09, in training 2 to 3" in result.stderr
 
 
-def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_model, tmp_path):
+def test_a_result_that_the_model_is_unsure_of_gets_a_warning(gdtool, picture, tiny_model, tmp_path):
     model = shutil.copytree(tiny_model, tmp_path / "model")
     for name, high in (("sure", 1e6), ("unsure", 0.0)):
         (model / "pictures.json").write_text(json.dumps({"outline_blur": {"low": 0.0, "high": high}}))
@@ -234,17 +234,17 @@ def test_a_result_that_the_model_is_unsure_of_is_told(gdtool, picture, tiny_mode
         result = sample(gdtool, "ball.png", "--model", model, "-o", name)
         record = json.loads((tmp_path / name / MANIFEST).read_text())
         width = record["content"]["report"]["outline_blur"]
-        told = [text for text in record["warnings"] if "unsure" in text]
+        doubts = [text for text in record["warnings"] if "unsure" in text]
         assert result.returncode == 0
         assert width > 0
-        assert len(told) == (name == "unsure")
-    assert f"blurred over {width:.1f} pixels, 0.0 at most is usual" in told[0]
-    assert told[0] in result.stderr
+        assert len(doubts) == (name == "unsure")
+    assert f"blurred over {width:.1f} pixels, 0.0 at most is usual" in doubts[0]
+    assert doubts[0] in result.stderr
     # What is usual is known of one way of sampling.
     result = sample(gdtool, "ball.png", "--model", model, "--domains", "normal,depth", "-o", "other")
     record = json.loads((tmp_path / "other" / MANIFEST).read_text())
     assert not any("unsure" in text for text in record["warnings"])
-    assert "the model's doubt of its result" in {one["what"] for one in record["skipped"]}
+    assert "the model's doubt of its result" in {entry["what"] for entry in record["skipped"]}
 
 
 def test_loading_a_model_leaves_pytorchs_compiler_out():

@@ -37,10 +37,10 @@ def test_train_writes_a_model_that_validates_and_then_skips(gdtool, spheres, tmp
     assert [int(row["step"]) for row in rows] == [1, 2, 3, 4]
     assert all(float(row["loss"]) > 0 for row in rows)
     assert (model / "validation" / "step_000004.png").stat().st_size > 1000
-    told = list(csv.DictReader((model / "validation.csv").read_text().splitlines()))
-    assert [row["step"] for row in told] == ["4"]
-    assert 0 < float(told[0]["color"]) < 60
-    assert float(told[0]["seconds"]) > 0
+    validation_rows = list(csv.DictReader((model / "validation.csv").read_text().splitlines()))
+    assert [row["step"] for row in validation_rows] == ["4"]
+    assert 0 < float(validation_rows[0]["color"]) < 60
+    assert float(validation_rows[0]["seconds"]) > 0
     assert (model / "loss.png").is_file()
     assert "spheres" not in (model / "card.md").read_text()
     assert not list(model.glob("**/*.pt"))
@@ -55,13 +55,13 @@ def test_tensorboard_has_every_row_of_the_log(gdtool, spheres, tmp_path):
     loader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     run = gdtool("train", spheres, *TINY, "--steps", 4, "--held-out", 1, "--tensorboard", "-o", "model")
     assert run.returncode == 0, run.stderr
-    found = loader.EventAccumulator(str(tmp_path / "model/tensorboard"))
-    found.Reload()
+    events = loader.EventAccumulator(str(tmp_path / "model/tensorboard"))
+    events.Reload()
     rows = list(csv.DictReader((tmp_path / "model/loss.csv").read_text().splitlines()))
-    assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in found.Scalars("loss")] == [
+    assert [(event.step, pytest.approx(event.value, rel=1e-4)) for event in events.Scalars("loss")] == [
         (int(row["step"]), float(row["loss"])) for row in rows
     ]
-    assert [event.step for event in found.Images("validation")] == [4]
+    assert [event.step for event in events.Images("validation")] == [4]
 
 
 def test_without_the_package_tensorboard_is_refused(gdtool, spheres, tmp_path, monkeypatch):

@@ -32,21 +32,21 @@ def test_atlas_of_quads(gdtool, tmp_path, ring):
     assert len(mesh.faces) == len(ring[1])
     assert mesh.is_quad.all()
     assert mesh.uv is not None
-    found = folder.content
-    assert found.padding == 4
-    assert found.quads == 512
-    assert found.watertight
-    assert found.charts == found.report["charts"]
-    assert found.report["overlap"] == 0
-    assert found.report["mirrored"] == 0
-    assert found.coverage > 0.3
+    atlas_content = folder.content
+    assert atlas_content.padding == 4
+    assert atlas_content.quads == 512
+    assert atlas_content.watertight
+    assert atlas_content.charts == atlas_content.report["charts"]
+    assert atlas_content.report["overlap"] == 0
+    assert atlas_content.report["mirrored"] == 0
+    assert atlas_content.coverage > 0.3
     for picture in ("layout.png", "checkerboard.png"):
         assert folder.file(picture).stat().st_size > 1000
     assert "up to date" in gdtool("unwrap", "ring.obj", "--size", 512, "--mip-safe", 128).stderr
     assert gdtool("validate", "ring.asset/atlas").returncode == 0
 
 
-def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
+def test_valid_texture_coordinates_are_kept_without_redo(gdtool, tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.1, 0.9], [0.4, 0.9], [0.4, 0.6], [0.1, 0.6]])
     quad = np.array([[0, 1, 2, 3]], np.int32)
@@ -58,7 +58,7 @@ def test_own_coordinates_are_kept_unless_redo(gdtool, tmp_path):
     assert content(tmp_path / "leaf.asset/atlas")["coverage"] > 0.9
 
 
-def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
+def test_mirrored_coordinates_are_kept_with_a_warning(gdtool, tmp_path):
     vertices = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
     uv = np.array([[0.4, 0.9], [0.1, 0.9], [0.1, 0.6], [0.4, 0.6]])
     quad = np.array([[0, 1, 2, 3]], np.int32)
@@ -70,13 +70,13 @@ def test_mirrored_coordinates_are_kept_and_told(gdtool, tmp_path):
     assert "mirrored" not in gdtool("unwrap", "leaf.obj", "--redo").stderr
 
 
-def test_a_short_time_is_kept_and_told(gdtool, tmp_path, ring):
+def test_a_short_time_limit_is_met_and_reported(gdtool, tmp_path, ring):
     run = gdtool("unwrap", "ring.obj", "--size", 512, "--seconds", 0.01)
     assert run.returncode == 0, run.stderr
-    found = content(tmp_path / "ring.asset/atlas")
-    assert found["tried"]
-    assert found["report"]["overlap"] == 0
-    assert found["report"]["mirrored"] == 0
+    atlas_content = content(tmp_path / "ring.asset/atlas")
+    assert atlas_content["tried"]
+    assert atlas_content["report"]["overlap"] == 0
+    assert atlas_content["report"]["mirrored"] == 0
 
 
 def test_overlapping_coordinates_are_replaced(gdtool, tmp_path):
@@ -126,10 +126,12 @@ def test_symmetric_halves_share_their_texels(gdtool, tmp_path, ring):
 
     # Each vertex' corners lie where those of its mirror image do.
     def corners_of(vertices):
-        found = {}
+        atlas_content = {}
         for vertex, corner in zip(mesh.faces.ravel(), mesh.face_uvs.ravel(), strict=True):
-            found.setdefault(tuple(np.round(vertices[vertex], 6) + 0.0), set()).add(tuple(np.round(mesh.uv[corner], 6)))
-        return found
+            atlas_content.setdefault(tuple(np.round(vertices[vertex], 6) + 0.0), set()).add(
+                tuple(np.round(mesh.uv[corner], 6))
+            )
+        return atlas_content
 
     assert corners_of(mesh.vertices) == corners_of(mesh.vertices * (-1, 1, 1))
     assert gdtool("validate", "ring.asset/atlas").returncode == 0

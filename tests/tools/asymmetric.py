@@ -1,8 +1,8 @@
-"""Writes a .glb that shows at a glance what is mirrored: python asymmetric.py OUT.glb
+"""Write a .glb that shows at a glance what is mirrored: python asymmetric.py OUT.glb
 
-A grey slab with FRONT in readable letters on the side toward +Z, a red arm toward +X (the picture's right), a green one
-toward +Y (up), a blue one toward +Z (the viewer). On the slab's lower half a normal map raises a dome: lit from the
-upper left, its upper left is bright.
+A grey slab has FRONT in readable letters on the side toward +Z. A red arm points toward +X (the picture's right), a
+green one toward +Y (up), a blue one toward +Z (the viewer). On the slab's lower half a normal map raises a dome: lit
+from the upper left, its upper left is bright.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _TURNS = (
 
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Six sides (24 vertices, outward): vertices, normals, uv; the side toward +Z is the first."""
+    """Make the six sides of a box (24 vertices, outward): vertices, normals, uv; the side toward +Z is the first."""
     center, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
     vertices = np.concatenate([_CORNERS @ np.array(turn).T for turn in _TURNS])
     normals = np.repeat([np.array(turn)[:, 2] for turn in _TURNS], 4, 0)
@@ -36,7 +36,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> tu
 
 
 def asymmetric() -> Scene:
-    """The scene; the longest side is about 1."""
+    """Make the scene; its longest side is about 1."""
     import OpenImageIO as oiio
 
     size = 256

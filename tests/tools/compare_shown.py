@@ -1,9 +1,10 @@
-"""An asset as three.js and Blender show it, against gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
+"""Compare how three.js and Blender show an asset with gdtool: python compare_shown.py ASSET.glb [--peers-python PATH]
 
-Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full: of
-the base color without light, and in three.js of the asset lit by an environment (benchmarks/bake/asset.py has
-Blender's). three.js needs what show_in_three.mjs says; Blender a Python that has bpy. What is not there is
-named and left out."""
+Runs the show_in_* scripts of this folder and prints the PSNR in dB over the pixels that both pictures cover in full.
+The pictures show the base color without light, and in three.js also the asset lit by an environment
+(benchmarks/bake/asset.py has Blender's). three.js needs what show_in_three.mjs says; Blender needs a Python that has
+bpy. What is not installed is named and left out.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ SIZE = 512
 
 
 def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
-    """The (h, w, 4) picture in [0, 1] that a command writes to out, or why there is none."""
+    """Return the (h, w, 4) picture in [0, 1] that a command writes to out, or the reason why there is none."""
     from gdtool.images.io import read_image
 
     try:
@@ -36,7 +37,9 @@ def picture(command: list, out: Path, mode: str | Path) -> np.ndarray | str:
 
 
 def averaged(image: np.ndarray) -> np.ndarray:
-    """(SIZE, SIZE, 4) of image (s, s, 4), sRGB and straight alpha: means of squares in linear light."""
+    """Reduce an image (s, s, 4), sRGB with straight alpha, to (SIZE, SIZE, 4): averages of square blocks in linear
+    light.
+    """
     from gdtool.images.color import linear_from_srgb, srgb_from_linear
 
     step = image.shape[0] // SIZE
@@ -52,7 +55,10 @@ def averaged(image: np.ndarray) -> np.ndarray:
 
 
 def inner(coverage: np.ndarray) -> np.ndarray:
-    """(h, w) bool: pixels that are covered in full, as are their neighbours; multisampling may call an edge whole."""
+    """Return (h, w) bool: pixels that are covered in full, as are their neighbours.
+
+    Multisampling may report a pixel at the edge as fully covered.
+    """
     from scipy.ndimage import binary_erosion
 
     return binary_erosion(coverage > 0.999, iterations=2)
@@ -68,30 +74,37 @@ def main() -> None:
     parser.add_argument("--peers-python", type=Path)
     parser.add_argument("--env", default="mid")
     parser.add_argument("--keep", type=Path, help="folder for the pictures")
-    asked = parser.parse_args()
-    asset = asked.asset.resolve()
+    arguments = parser.parse_args()
+    asset = arguments.asset.resolve()
     with tempfile.TemporaryDirectory() as folder:
-        place = asked.keep or Path(folder)
+        place = arguments.keep or Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         place = place.resolve()
         light = place / "light.exr"
-        write_exr(light, studio(asked.env, 0, fit=False)[0].image.astype(np.float32))
-        own, three = [sys.executable, HERE / "show_in_gdtool.py", asset], ["node", HERE / "show_in_three.mjs", asset]
-        pairs = {"three.js, base color": (three, "unlit", "unlit"), "three.js, lit": (three, light, asked.env)}
-        if asked.peers_python:
-            pairs["Blender, base color"] = ([asked.peers_python, HERE / "show_in_blender.py", asset], "unlit", "unlit")
-        found: dict[str, float | str] = {}
+        write_exr(light, studio(arguments.env, 0, fit=False)[0].image.astype(np.float32))
+        gdtool_command, three = (
+            [sys.executable, HERE / "show_in_gdtool.py", asset],
+            ["node", HERE / "show_in_three.mjs", asset],
+        )
+        pairs = {"three.js, base color": (three, "unlit", "unlit"), "three.js, lit": (three, light, arguments.env)}
+        if arguments.peers_python:
+            pairs["Blender, base color"] = (
+                [arguments.peers_python, HERE / "show_in_blender.py", asset],
+                "unlit",
+                "unlit",
+            )
+        figures: dict[str, float | str] = {}
         for name, (command, mode, own_mode) in pairs.items():
             ours, theirs = (
-                picture(own, place / f"gdtool_{own_mode}.png", own_mode),
+                picture(gdtool_command, place / f"gdtool_{own_mode}.png", own_mode),
                 picture(command, place / f"{name}.png", mode),
             )
             if isinstance(ours, str) or isinstance(theirs, str):
-                found[name] = ours if isinstance(ours, str) else theirs
+                figures[name] = ours if isinstance(ours, str) else theirs
                 continue
             where = inner(ours[..., 3]) & inner(theirs[..., 3])
-            found[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
-    print(json.dumps(found))
+            figures[name] = round(psnr(theirs[..., :3], ours[..., :3], where), 2)
+    print(json.dumps(figures))
 
 
 if __name__ == "__main__":

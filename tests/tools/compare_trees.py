@@ -40,7 +40,7 @@ BUNDLED_MODEL = re.compile(r"^.*gdtool/models/")  # each tree has its own
 
 @dataclass(frozen=True)
 class Case:
-    """A command line; its output folder and the file with its stdout have the case's name."""
+    """Hold a command line, and the name of the case, which its output folder and the file with its stdout have."""
 
     name: str
     words: tuple[str, ...]
@@ -54,7 +54,7 @@ VARIATION = 0.15
 
 
 def cases() -> list[Case]:
-    """All commands, in an order in which each finds what it reads."""
+    """List all commands, in an order in which each finds what it reads."""
     found: list[Case] = []
 
     def add(name: str, line: str, needs: str = "", varies: bool = False) -> None:
@@ -257,7 +257,9 @@ def write_picture(path: Path, pixels) -> None:
 
 
 def disturbed(views: Path, folder: Path, rng) -> None:
-    """A plain folder of the views' pictures and cameras, the colors with noise and each with a gain of its own."""
+    """Write a plain folder of the views' pictures and cameras, the colors with noise and each multiplied by a random
+    gain.
+    """
     import OpenImageIO as oiio
 
     folder.mkdir()
@@ -277,7 +279,7 @@ def disturbed(views: Path, folder: Path, rng) -> None:
 
 
 def nerf(views: Path, folder: Path, names: list[str]) -> None:
-    """A folder with transforms.json: perspective pictures are not needed, the orthographic ones stand for them."""
+    """Write a folder with transforms.json; orthographic pictures stand in for perspective ones."""
     import numpy as np
 
     folder.mkdir()
@@ -297,8 +299,10 @@ def nerf(views: Path, folder: Path, names: list[str]) -> None:
 
 
 def importable(tree: Path, folder: Path) -> Path:
-    """A folder from which Python imports the gdtool of a checkout, as it is installed: with commands/ and schemas/
-    inside."""
+    """Make a folder from which Python imports the gdtool of a checkout.
+
+    It is laid out as gdtool is installed: with commands/ and schemas/ inside.
+    """
     package = folder / "gdtool"
     shutil.rmtree(folder, ignore_errors=True)
     package.mkdir(parents=True)
@@ -319,7 +323,7 @@ def gdtool(
 
 
 def run_all(site: Path, folder: Path, chosen: list[Case], python: str) -> None:
-    """Run the cases in a folder that holds the sources; what was run already is not run again."""
+    """Run the cases in a folder that holds the sources; cases whose results are there already are not run again."""
     for number, case in enumerate(chosen):
         told = folder / f"{case.name}.stdout"
         if told.exists():
@@ -340,7 +344,7 @@ def run_all(site: Path, folder: Path, chosen: list[Case], python: str) -> None:
 
 
 class Sentences:
-    """The sentences that replace others, from a table of two columns; {} stands for what varies."""
+    """Replace sentences by others, from a table of two columns; {} stands for the part that varies."""
 
     def __init__(self, path: Path):
         self._rules: list[tuple[re.Pattern[str], str]] = []
@@ -351,7 +355,7 @@ class Sentences:
         self.used = 0
 
     def translated(self, text: str) -> str:
-        """The text with every old sentence replaced."""
+        """Return the text with every old sentence replaced by the new one."""
         for old, new in self._rules:
 
             def filled(match: re.Match[str], new: str = new) -> str:
@@ -364,7 +368,7 @@ class Sentences:
 
 
 class Comparison:
-    """Differences between two folders of results."""
+    """Collect the differences between two folders of results."""
 
     def __init__(self, base: Path, tree: Path, sentences: Sentences):
         self.base, self.tree, self.sentences = base, tree, sentences
@@ -418,13 +422,15 @@ class Comparison:
         self._fields(str(relative), self._plain(before), self._plain(after))
 
     def _plain(self, value):
-        """A parsed JSON without what tells how a run went or which version ran, its sentences replaced."""
+        """Return a parsed JSON with its sentences replaced, without entries on the run and the version."""
         if isinstance(value, dict):
             return {
-                key: self._plain(one) for key, one in value.items() if key not in NOT_COMPARED and not TIMES.search(key)
+                key: self._plain(item)
+                for key, item in value.items()
+                if key not in NOT_COMPARED and not TIMES.search(key)
             }
         if isinstance(value, list):
-            return [self._plain(one) for one in value]
+            return [self._plain(item) for item in value]
         return (
             BUNDLED_MODEL.sub("gdtool/models/", self.sentences.translated(value)) if isinstance(value, str) else value
         )
@@ -445,7 +451,7 @@ class Comparison:
                 self.differences.append(f"{place} {key}: {old.get(key)} became {new.get(key)}")
 
     def _how_far(self, before: Path, after: Path) -> str:
-        """How much two files differ, in the values where they are pictures, in bytes elsewhere."""
+        """Say how much two files differ: in values where they are pictures, in bytes elsewhere."""
         import numpy as np
 
         if before.suffix in (".png", ".exr", ".hdr"):
@@ -462,7 +468,7 @@ class Comparison:
 
 
 def _without_times(path: Path) -> list[list[str]]:
-    """The cells of a .csv file without its columns of times."""
+    """Return the cells of a .csv file without its columns of times."""
     with path.open(newline="") as file:
         rows = list(csv.reader(file))
     kept = [k for k, name in enumerate(rows[0]) if not re.search("minutes|seconds", name)]
@@ -470,7 +476,7 @@ def _without_times(path: Path) -> list[list[str]]:
 
 
 def checkout(base: str, folder: Path) -> Path:
-    """The root of the base: itself where it is a folder, else the commit's files below folder."""
+    """Return the root of the base: the path itself where it is a folder, else a checkout of the commit below folder."""
     if Path(base).is_dir():
         return Path(base).resolve()
     commit = subprocess.run(
@@ -537,7 +543,7 @@ def main() -> int:
 
 
 def _with_what_they_read(all_cases: list[Case], beginnings: list[str]) -> list[Case]:
-    """The cases whose names begin so, and those whose results they read, in order."""
+    """Return the cases whose names begin with one of `beginnings`, and those whose results they read, in order."""
     by_name = {case.name: case for case in all_cases}
     wanted = {name for name in by_name if name.startswith(tuple(beginnings))}
     while (

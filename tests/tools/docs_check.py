@@ -1,6 +1,6 @@
 """Run the ```sh blocks of docs/cookbook.md, each in a new folder with a copy of examples/ (`make docs-check`).
 
-    python tests/tools/docs_check.py [NUMBER ...]        only these pipelines, by the numbers of their headings
+  python tests/tools/docs_check.py [NUMBER ...]     only these pipelines, by the numbers of their headings
 
 The gdtool that is run is the one on PATH. Exits with 1 when a block fails, and shows what it wrote to stderr.
 """
@@ -22,12 +22,14 @@ BLOCK = re.compile(r"^## (\d+)\. ([^\n]+)\n(.*?)^```sh\n(.*?)^```", re.MULTILINE
 
 
 def blocks(text: str) -> list[tuple[int, str, str]]:
-    """Number, title and script of each pipeline."""
+    """Return the number, title and script of each pipeline."""
     return [(int(number), title, script) for number, title, _, script in BLOCK.findall(text)]
 
 
 def run(script: str) -> tuple[bool, float, str]:
-    """Whether a script ran through, its seconds, and its stderr. A pipe fails when any of its commands does."""
+    """Run a script; returns whether it succeeded, its seconds, and its stderr. A pipe fails when any of its commands
+    does.
+    """
     with tempfile.TemporaryDirectory() as folder:
         shutil.copytree(ROOT / "examples", Path(folder, "examples"))
         start = time.perf_counter()

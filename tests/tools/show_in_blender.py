@@ -1,7 +1,8 @@
-"""Renders a .glb from the front in Blender: python show_in_blender.py MODEL.glb OUT.png [unlit]   (pip install bpy)
+"""Render a .glb from the front in Blender: python show_in_blender.py MODEL.glb OUT.png [unlit]     (pip install bpy)
 
-Orthographic, half-width 0.72 of the longest side, the object's middle in the picture's, sun from the upper left, as
-show_in_three.mjs does it: the two pictures and gdtool's own front view show the same object the same way round.
+The camera is orthographic, its half-width 0.72 of the longest side, the object's middle in the picture's. The sun is at
+the upper left, as in show_in_three.mjs. The two pictures and gdtool's front view have to show the object in the same
+orientation.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ SIZE = 512
 
 
 def unlit() -> None:
-    """Every material shines with its base color, and with nothing else."""
+    """Make every material emit its base color, and reflect nothing."""
     for material in bpy.data.materials:
         tree = material.node_tree
         shader = next((n for n in tree.nodes if n.type == "BSDF_PRINCIPLED"), None) if tree else None

@@ -1,7 +1,7 @@
-"""Renders a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit|ENV]
+"""Render a model from the front with gdtool: python show_in_gdtool.py MODEL OUT.png [unlit|ENV]
 
-The frame and the sun of show_in_three.mjs and show_in_blender.py, shaded from the exact buffers with Lambert's law; or
-lit by an environment without shadows, of which three.js has none for such a light.
+Frame and sun are those of show_in_three.mjs and show_in_blender.py. The picture is shaded from the exact buffers with
+Lambert's law, or lit by an environment without shadows, because three.js has no shadows for such a light.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the documents show can be typed: every command they name exists, with every option they give it."""
+"""Check that every command that the documents name exists, with every option that they give it."""
 
 import importlib
 import re
@@ -40,8 +40,8 @@ def test_commands_and_options_exist(page):
 
 def test_the_cookbook_has_its_pipelines_in_order():
     text = COOKBOOK.read_text()
-    found = blocks(text)
-    assert [number for number, _, _ in found] == list(range(1, len(found) + 1))
-    assert len(found) >= 10
-    assert len(FENCE.findall(text)) == len(found)  # none is left out of the check
-    assert all("gdtool" in script for _, _, script in found)
+    numbered_blocks = blocks(text)
+    assert [number for number, _, _ in numbered_blocks] == list(range(1, len(numbered_blocks) + 1))
+    assert len(numbered_blocks) >= 10
+    assert len(FENCE.findall(text)) == len(numbered_blocks)  # none is left out of the check
+    assert all("gdtool" in script for _, _, script in numbered_blocks)

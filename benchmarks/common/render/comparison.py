@@ -1,5 +1,8 @@
-"""What the benchmarks of render-dataset and relight share: renderers as children, errors, times at an error, table,
-JSON and plot."""
+"""Share what the benchmarks of render-dataset and relight need to compare renderers.
+
+Renderers run as child processes; their errors and their times at an error are measured; the results are a table, JSON
+and a plot.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ SHORT = 5.0
 
 
 def arguments(text: str) -> argparse.ArgumentParser:
-    """The options of both."""
+    """Make the parser of the options that both benchmarks share."""
     parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model")
     parser.add_argument("env")
@@ -45,7 +48,9 @@ def arguments(text: str) -> argparse.ArgumentParser:
 
 @dataclass(frozen=True)
 class Job:
-    """One row: who renders what, with the command line that does it and the reference that it is scored against."""
+    """Hold one row of the table: method, samples per pixel, command line, and the reference that its errors are
+    measured against.
+    """
 
     method: str
     samples: int
@@ -59,27 +64,32 @@ class Job:
 
 
 def peers_environment() -> dict[str, str]:
-    """The environment for peers: drjit's LLVM variants need a libLLVM that knows the processor; the newest found is
-    named."""
+    """Return the environment variables for the peers' processes.
+
+    The LLVM variants of drjit (Mitsuba) need a libLLVM that knows the processor: the newest one on the machine is
+    named.
+    """
     out = dict(os.environ)
     if "DRJIT_LIBLLVM_PATH" not in out:
-        places = (
+        patterns = (
             (Path("/usr/lib"), "llvm-*/lib/libLLVM*.so*"),
             (Path("/usr/lib"), "*/libLLVM*.so*"),
             (Path.home(), ".rustup/toolchains/stable*/lib/libLLVM.so*"),
         )
-        found = {
+        versions = {
             str(path): int("".join(c for c in path.name.split("libLLVM")[1].lstrip("-.so")[:2] if c.isdigit()) or 0)
-            for place, pattern in places
-            for path in place.glob(pattern)
+            for folder, pattern in patterns
+            for path in folder.glob(pattern)
         }
-        if found:
-            out["DRJIT_LIBLLVM_PATH"] = max(found, key=found.get)
+        if versions:
+            out["DRJIT_LIBLLVM_PATH"] = max(versions, key=versions.get)
     return out
 
 
 def in_child(command: tuple[str, ...], limit_seconds: float = 900) -> dict | None:
-    """The JSON object that a command prints last; None, with the reason told, if it fails or takes too long."""
+    """Run a command and return the JSON object that it prints last; None, after a message, where it fails or takes too
+    long.
+    """
     try:
         done = subprocess.run(
             list(command), capture_output=True, text=True, timeout=limit_seconds, env=peers_environment()
@@ -95,7 +105,7 @@ def in_child(command: tuple[str, ...], limit_seconds: float = 900) -> dict | Non
 
 
 def has(python: Path | None, module: str) -> bool:
-    """Whether a Python interpreter can import a module."""
+    """Tell whether a Python interpreter can import a module."""
     if python is None or not Path(python).exists():
         return False
     return (
@@ -108,7 +118,7 @@ def has(python: Path | None, module: str) -> bool:
 
 
 def stored(name: str, image: np.ndarray) -> np.ndarray:
-    """A domain's image as a picture stores it: sRGB for colors, (n + 1) / 2 for normals."""
+    """Encode an image of a domain as gdtool's pictures store it: sRGB for colors, (n + 1) / 2 for normals."""
     from gdtool.images.color import srgb_from_linear
 
     if name in ("color", "albedo"):
@@ -117,8 +127,11 @@ def stored(name: str, image: np.ndarray) -> np.ndarray:
 
 
 def errors(images: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dict[str, float]:
-    """PSNR in dB over the views that both have: of each domain inside, over pixels that the reference covers wholly,
-    and of the whole color picture, with coverage and the black around it, as "color"."""
+    """Measure the PSNR in dB of each domain, over the views that both renderings have.
+
+    Each domain is measured over the pixels that the reference covers wholly ("color inside" for color). "color" is
+    measured over whole pictures, with partly covered pixels and the black around the object.
+    """
     from gdtool.images.metrics import psnr
 
     common = [name for name in reference["names"] if name in images["names"]]
@@ -146,18 +159,20 @@ def run(
     finish,
     repeats: int = 3,
 ) -> list[dict]:
-    """The rows of all jobs, interleaved over their repeats, kept in folder/name.json as they come.
+    """Run all jobs and return their rows, the median of each figure; results are kept in folder/.name as they come.
 
-    references: name to command; {out} in a command is where it writes its images, which stay in folder/.name until all
-    is done. A run that was killed goes on where it was, if key, what was asked for, is the same. finish(rows) writes
-    the report."""
-    place = folder / f".{name}"
-    place.mkdir(parents=True, exist_ok=True)
-    log = place / "rows.json"
+    references: command lines by name; {out} in a command stands for the file that it writes its images to. The jobs
+    take turns, repeat after repeat, so that slow phases of the machine hit all of them. A run that was killed goes on
+    where it was, if key (what was asked for) is the same. finish(rows, head) writes the report; then folder/.name is
+    removed.
+    """
+    kept_folder = folder / f".{name}"
+    kept_folder.mkdir(parents=True, exist_ok=True)
+    log = kept_folder / "rows.json"
     before = json.loads(log.read_text()) if log.exists() else {}
     runs: dict[str, list[dict]] = before["runs"] if before.get("key") == key else {}
     if not runs:
-        for old in place.glob("reference-*.npz"):
+        for old in kept_folder.glob("reference-*.npz"):
             old.unlink()
     head = before.get("machine", []) if runs else []
     head = [*head, f"{machine()}. {busy()}".strip()]
@@ -167,16 +182,16 @@ def run(
 
     keep()
     for which, command in references.items():
-        path = place / f"reference-{which}.npz"
+        path = kept_folder / f"reference-{which}.npz"
         if not path.exists():
             say(f"reference of {which}")
             in_child(tuple(part.replace("{out}", str(path)) for part in command))
     for repeat in range(repeats):
         for job in jobs:
-            done, truth = runs.setdefault(job.name, []), place / f"reference-{job.reference}.npz"
+            done, truth = runs.setdefault(job.name, []), kept_folder / f"reference-{job.reference}.npz"
             if len(done) > repeat or not truth.exists() or (done and done[0]["wall s"] > SHORT):
                 continue
-            out = place / "out.npz"
+            out = kept_folder / "out.npz"
             cost = in_child(tuple(part.replace("{out}", str(out)) for part in job.command))
             if cost is not None:
                 done.append({**cost, **errors(dict(np.load(out)), dict(np.load(truth)))})
@@ -194,15 +209,19 @@ def run(
         if runs.get(job.name)
     ]
     finish(rows, head)
-    shutil.rmtree(place)
+    shutil.rmtree(kept_folder)
     return rows
 
 
 def time_at(
     rows: list[dict], method: str, quality: str, decibels: float, seconds: str = "wall s"
 ) -> tuple[float, bool] | None:
-    """Seconds at which a method's curve reaches a PSNR, by straight lines over the logarithm of time; and whether that
-    lies inside what was measured. Beyond, halving the squared error is taken to cost twice the time."""
+    """Interpolate the seconds at which a method reaches a PSNR; also tells whether that lies inside the measured range.
+
+    rows: of all methods. quality: the key of the PSNR. decibels: the PSNR. seconds: the key of the time. Between rows
+    the PSNR is linear in the logarithm of time. Beyond the best row, halving the squared error is assumed to take twice
+    the time. Returns None for a method without rows.
+    """
     points = sorted(
         (row[seconds], row[quality]) for row in rows if row["method"] == method and row.get(quality) is not None
     )
@@ -223,20 +242,20 @@ def time_at(
 
 
 def comparison(rows: list[dict], quality: str, decibels: float, ours: list[str], peers: list[str]) -> list[str]:
-    """Lines that say who takes how long to a PSNR, and what share of the best peer's time ours is."""
+    """List sentences on how long each method takes to reach a PSNR, and gdtool's share of the best peer's time."""
     lines = []
     for seconds in ("wall s", "cpu s"):
-        found = {method: time_at(rows, method, quality, decibels, seconds) for method in (*ours, *peers)}
-        found = {method: at for method, at in found.items() if at is not None}
-        theirs = [found[method][0] for method in peers if method in found]
+        times = {method: time_at(rows, method, quality, decibels, seconds) for method in (*ours, *peers)}
+        times = {method: at for method, at in times.items() if at is not None}
+        theirs = [times[method][0] for method in peers if method in times]
         for method in ours:
-            if method in found and theirs:
+            if method in times and theirs:
                 parts = ", ".join(
                     f"{m} {t:.2f}{'' if inside else ' (extrapolated)'}"
-                    for m, (t, inside) in found.items()
+                    for m, (t, inside) in times.items()
                     if m in peers
                 )
-                at, inside = found[method]
+                at, inside = times[method]
                 lines.append(
                     f"* {quality} at {decibels:g} dB, {seconds}: {method} "
                     f"{at:.2f}{'' if inside else ' (extrapolated)'}; {parts}: "
@@ -255,8 +274,11 @@ def write(
     plots: list[tuple[str, str]],
     findings: list[str],
 ) -> None:
-    """name.json, name.md and name.png (plots: title and quality each, against processor seconds, a curve a method) in
-    folder."""
+    """Write name.json, name.md and name.png into folder.
+
+    plots: title and key of the PSNR of each plot, which is drawn against processor seconds with a curve for each
+    method. shown: the columns of the table. head: lines about the machine. findings: sentences of comparison().
+    """
     import matplotlib
 
     matplotlib.use("agg")
@@ -293,7 +315,7 @@ def write(
 
 
 def errors_text() -> str:
-    """How the figures are to be read."""
+    """Return the paragraph of the report that says how its figures were measured."""
     return (
         "PSNR of the pictures as stored (sRGB; normals halved) against a converged reference of the same renderer "
         "with other random "

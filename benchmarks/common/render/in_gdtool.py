@@ -18,6 +18,7 @@ import numpy as np
 
 
 def main() -> None:
+    """Render the views that the command line names, and write their images."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in ("model", "env", "out"):
         parser.add_argument(name)
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("--light-samples", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--converged", action="store_true", help="every pixel gets all samples")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     import torch
 
     from benchmarks.common.render.scene import normalised
@@ -50,32 +51,32 @@ def main() -> None:
         "torch.quasirandom",
     ):
         importlib.import_module(module)
-    scene = normalised(load_scene(asked.model))
-    if asked.converged:
-        render.BASE_SAMPLES = asked.samples
-    environment, lobes, _ = studio(asked.env, asked.seed, fit=asked.light == "sg")
+    scene = normalised(load_scene(arguments.model))
+    if arguments.converged:
+        render.BASE_SAMPLES = arguments.samples
+    environment, lobes, _ = studio(arguments.env, arguments.seed, fit=arguments.light == "sg")
     wall, processor = time.perf_counter(), time.process_time()
     renderer = render.Renderer(scene, len(os.sched_getaffinity(0)))
     color = None
-    if asked.light in ("sampled", "prefiltered"):
+    if arguments.light in ("sampled", "prefiltered"):
         color = DirectLight(
-            renderer, environment, asked.light_samples, asked.seed, options=LightOptions(asked.light)
+            renderer, environment, arguments.light_samples, arguments.seed, options=LightOptions(arguments.light)
         ).color()
-    cameras = {camera.name: camera for camera in rig("six", asked.size)}
+    cameras = {camera.name: camera for camera in rig("six", arguments.size)}
 
     def view(camera):
-        frame = renderer.buffers(camera, asked.samples, color)
-        if asked.light == "sg":
+        frame = renderer.buffers(camera, arguments.samples, color)
+        if arguments.light == "sg":
             frame["color"] = closed_form_image(frame, camera, lobes)
         if "color" in frame:
             frame["color"] = frame["color"] * frame["mask"][..., None]
         return frame
 
-    frames = list(renderer.render_each(view, [cameras[name] for name in asked.views.split(",")]))
+    frames = list(renderer.render_each(view, [cameras[name] for name in arguments.views.split(",")]))
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
     np.savez(
-        asked.out,
-        names=np.array(asked.views.split(",")),
+        arguments.out,
+        names=np.array(arguments.views.split(",")),
         **{key: np.stack([frame[key] for frame in frames]) for key in frames[0]},
     )
     print(json.dumps({**seconds, "rays": renderer.counts.samples + renderer.counts.shadow_rays}))

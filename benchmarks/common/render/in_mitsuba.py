@@ -21,31 +21,37 @@ import numpy as np
 
 
 def texture(image: np.ndarray, raw: bool) -> dict:
+    """Describe a bitmap texture of an image (h, w, c); raw: its values are linear, not sRGB."""
     return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(image)), "raw": raw, "filter_type": "bilinear"}
 
 
 def value(scene: dict, name: str) -> dict | float:
-    """A texture or a number of the material."""
-    found = scene[name]
-    if found.ndim == 3:
-        return texture(found, raw=not name.endswith("base_color"))
-    return {"type": "rgb", "value": found.tolist()} if found.ndim else float(found)
+    """Describe a material's input: a texture, a color, or a number."""
+    stored = scene[name]
+    if stored.ndim == 3:
+        return texture(stored, raw=not name.endswith("base_color"))
+    return {"type": "rgb", "value": stored.tolist()} if stored.ndim else float(stored)
 
 
-def mesh(scene: dict, key: str, place: str) -> dict:
+def mesh(scene: dict, key: str, folder: str) -> dict:
+    """Describe the mesh of one material and its BSDF; key: of the material in SCENE.npz. The mesh is written to a .ply
+    in folder.
+    """
     vertices, faces, normals, uv = (scene[f"{key}_{name}"] for name in ("vertices", "faces", "normals", "uv"))
     colors = scene[f"{key}_colors"]
-    made = mi.Mesh(key, len(vertices), len(faces), has_vertex_normals=len(normals) > 0, has_vertex_texcoords=True)
+    mitsuba_mesh = mi.Mesh(
+        key, len(vertices), len(faces), has_vertex_normals=len(normals) > 0, has_vertex_texcoords=True
+    )
     if len(colors):
-        made.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
-    fields = mi.traverse(made)
+        mitsuba_mesh.add_attribute("vertex_color", 3, np.ravel(colors).astype(np.float32))
+    fields = mi.traverse(mitsuba_mesh)
     for name, array in {"vertex_positions": vertices, "vertex_normals": normals, "vertex_texcoords": uv}.items():
         if len(array):
             fields[name] = np.ravel(array).astype(np.float32)
     fields["faces"] = np.ravel(faces).astype(np.uint32)
     fields.update()
-    path = str(Path(place, f"{key}.ply"))
-    made.write_ply(path)
+    path = str(Path(folder, f"{key}.ply"))
+    mitsuba_mesh.write_ply(path)
     color = {"type": "mesh_attribute", "name": "vertex_color"} if len(colors) else value(scene, f"{key}_base_color")
     bsdf = {
         "type": "principled",
@@ -66,6 +72,7 @@ def mesh(scene: dict, key: str, place: str) -> dict:
 
 
 def main() -> None:
+    """Render the views that the command line names, and write their images."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene")
     parser.add_argument("out")
@@ -73,13 +80,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512)
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     import drjit as dr
     from mitsuba import ScalarTransform4f as Transform
 
-    stored = dict(np.load(asked.scene))
-    with tempfile.TemporaryDirectory() as place:
+    stored = dict(np.load(arguments.scene))
+    with tempfile.TemporaryDirectory() as folder:
         # Mitsuba's map begins a quarter turn before gdtool's.
         light = np.roll(stored["light"], -(stored["light"].shape[1] // 4), 1)
         keys = [name.removesuffix("_vertices") for name in stored if name.endswith("_vertices")]
@@ -87,7 +94,7 @@ def main() -> None:
             {
                 "type": "scene",
                 "light": {"type": "envmap", "bitmap": mi.Bitmap(light.astype(np.float32))},
-                **{key: mesh(stored, key, place) for key in keys},
+                **{key: mesh(stored, key, folder) for key in keys},
             }
         )
     integrator = mi.load_dict({"type": "direct", "hide_emitters": True})
@@ -106,8 +113,8 @@ def main() -> None:
                 @ Transform().scale([half, half, 1]),
                 "film": {
                     "type": "hdrfilm",
-                    "width": asked.size,
-                    "height": asked.size,
+                    "width": arguments.size,
+                    "height": arguments.size,
                     "pixel_format": "rgba",
                     "rfilter": {"type": "box"},
                 },
@@ -118,18 +125,18 @@ def main() -> None:
         dr.eval(image)
         return np.array(image)
 
-    names = asked.views.split(",")
+    names = arguments.views.split(",")
     # What one launch may hold: a reference is the mean of several.
-    parts = max(1, asked.samples // 256)
-    picture(names[0], asked.samples // parts, 10_000)
+    parts = max(1, arguments.samples // 256)
+    picture(names[0], arguments.samples // parts, 10_000)
     wall, processor = time.perf_counter(), time.process_time()
     images = [
-        np.mean([picture(name, asked.samples // parts, asked.seed + 100 * part) for part in range(parts)], 0)
+        np.mean([picture(name, arguments.samples // parts, arguments.seed + 100 * part) for part in range(parts)], 0)
         for name in names
     ]
     seconds = {"wall s": time.perf_counter() - wall, "cpu s": time.process_time() - processor}
     frames = np.stack(images)
-    np.savez(asked.out, names=np.array(names), color=frames[..., :3], mask=frames[..., 3])
+    np.savez(arguments.out, names=np.array(names), color=frames[..., :3], mask=frames[..., 3])
     print(json.dumps(seconds), flush=True)
     os._exit(0)
 

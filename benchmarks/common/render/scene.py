@@ -1,8 +1,8 @@
-"""A model and a light as in_blender.py and in_mitsuba.py read them.
+"""Write a model and a light as in_blender.py and in_mitsuba.py read them.
 
   python -m benchmarks.common.render.scene MODEL ENV FOLDER
 
-Writes FOLDER/model.glb (or names the .glb or .gltf that was given), light.exr, and scene.npz with a mesh a material.
+Writes FOLDER/model.glb (a .glb or .gltf is used as it is), light.exr, and scene.npz with a mesh for each material.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gdtool.assets.scene import Scene, Texture
 
 
 def normalised(scene: Scene) -> Scene:
-    """Box centred, longest side 1."""
+    """Move a scene so that its bounding box is centred, and scale its longest side to 1."""
     from gdtool.geometry.frames import invert_similarity, transform_points, unit_box
 
     matrix = unit_box(scene.vertices[np.unique(scene.faces)])
@@ -26,8 +26,10 @@ def normalised(scene: Scene) -> Scene:
 
 
 def times(texture: Texture | None, factor: np.ndarray, channels: slice) -> np.ndarray:
-    """(h, w, c) the texture's channels by a factor, 8-bit where the factor is 1, else float32; or the factor (c,)
-    itself."""
+    """Multiply the channels of a texture by a factor (c,); returns (h, w, c), or the factor where there is no texture.
+
+    The result is 8-bit as stored where the factor is 1, else linear float32.
+    """
     if texture is None:
         return factor
     from gdtool.images.color import linear_from_srgb
@@ -41,8 +43,12 @@ def times(texture: Texture | None, factor: np.ndarray, channels: slice) -> np.nd
 
 
 def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
-    """Arrays of each material's mesh: vertices, faces, normals or none, uv, vertex colors or none, and its inputs, each
-    an image or a number. The UV set and transform are those of the base color, else of the normal map."""
+    """Return the arrays of each material's mesh by name: m0_vertices, m0_faces, m0_normals, m0_uv, m0_colors,
+    m0_base_color, …
+
+    normals and colors are empty where the scene has none. Each material input is an image or a number. One UV set and
+    transform serve all textures: those of the base color, else of the normal map.
+    """
     from gdtool.shading.render.textures import transform_uv
 
     out = {}
@@ -51,7 +57,7 @@ def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
         if not len(faces):
             continue
         used, flat = np.unique(faces, return_inverse=True)
-        one = next(
+        texture = next(
             (
                 t
                 for t in (material.base_color_texture, material.normal_texture, material.metallic_roughness_texture)
@@ -59,8 +65,8 @@ def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
             ),
             None,
         )
-        uv = None if one is None or one.uv_set >= len(scene.uvs) else scene.uvs[one.uv_set]
-        uv = np.zeros((len(used), 2)) if uv is None else transform_uv(one, uv[used])
+        uv = None if texture is None or texture.uv_set >= len(scene.uvs) else scene.uvs[texture.uv_set]
+        uv = np.zeros((len(used), 2)) if uv is None else transform_uv(texture, uv[used])
         factor = np.asarray(material.base_color[:3])
         surface = material.metallic_roughness_texture
         key = f"m{number}"
@@ -85,7 +91,10 @@ def for_mitsuba(scene: Scene) -> dict[str, np.ndarray]:
 
 
 def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str]:
-    """Paths of the model, the light and the scene that the peers read, written where needed."""
+    """Write what the peers read, and return the paths of model, light and scene.
+
+    The result also has the azimuths of the cameras in degrees, their half width and the number of faces.
+    """
     from gdtool.assets.gltf.write import write_glb
     from gdtool.assets.load import load_scene
     from gdtool.cameras import rig
@@ -96,10 +105,10 @@ def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str
     scene = normalised(load_scene(model))
     light = studio(env, seed, fit=False)[0].image.astype(np.float32)
     write_exr(folder / "light.exr", light)
-    place = model
+    model_path = model
     if Path(model).suffix not in (".glb", ".gltf"):
-        place = str(folder / "model.glb")
-        write_glb(place, scene)
+        model_path = str(folder / "model.glb")
+        write_glb(model_path, scene)
     cameras = rig("six", 16)
     azimuths = {
         camera.name: float(np.degrees(np.arctan2(camera.position[0], camera.position[2]))) for camera in cameras
@@ -112,24 +121,25 @@ def exported(model: str, env: str, folder: Path, seed: int = 0) -> dict[str, str
         **{f"azimuth_{name}": angle for name, angle in azimuths.items()},
         **for_mitsuba(scene),
     )
-    found = {
-        "model": place,
+    written = {
+        "model": model_path,
         "light": str(folder / "light.exr"),
         "scene": str(folder / "scene.npz"),
         "azimuths": azimuths,
         "half_width": half,
         "faces": len(scene.faces),
     }
-    (folder / "scene.json").write_text(json.dumps(found))
-    return found
+    (folder / "scene.json").write_text(json.dumps(written))
+    return written
 
 
 def main() -> None:
+    """Write the files for the model and the light that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name in ("model", "env", "folder"):
         parser.add_argument(name)
-    asked = parser.parse_args()
-    print(json.dumps(exported(asked.model, asked.env, Path(asked.folder))))
+    arguments = parser.parse_args()
+    print(json.dumps(exported(arguments.model, arguments.env, Path(arguments.folder))))
 
 
 if __name__ == "__main__":

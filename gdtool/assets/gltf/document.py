@@ -17,7 +17,7 @@ import numpy as np
 from gdtool.assets.gltf.schema import Accessor, Document, Sparse
 from gdtool.core.errors import InputError, from_os_error
 from gdtool.core.memory import require_memory
-from gdtool.core.names import shown, uri_path
+from gdtool.core.names import quoted, uri_path
 from gdtool.core.reading import bytes_of, require_regular_file
 
 SUPPORTED = {
@@ -46,7 +46,7 @@ SIMPLIFY = "export it with fewer faces or fewer instances"
 
 @dataclass(frozen=True)
 class _Elements:
-    """Where equally spaced elements lie: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
+    """Locate equally spaced elements: buffer view, byte offset, byte stride (None: packed), count, type, shape."""
 
     view: int
     offset: int
@@ -60,10 +60,8 @@ class GltfFile:
     """Hold an opened .glb or .gltf: its decoded document, and its bytes and accessors on demand.
 
     Buffers, buffer views and the chunks of a GLB are memory views of what was read, not copies. All methods raise
-    InputError for breaches of the specification that they meet, and ResourceError where the result would take more
-    memory than one input may.
-
-    notes collects what was ignored or assumed, a line each.
+    InputError where they meet a breach of the specification, and ResourceError where the result would take more memory
+    than one input may. notes collects what was ignored or assumed, a line each.
     """
 
     def __init__(self, path: Path):
@@ -157,7 +155,7 @@ class GltfFile:
         path = uri_path(self.path.parent, uri, self.path, f"the URI of {what}")
         if not path.exists():
             raise self.refuse(
-                f"{what} is in {shown(uri)}, which does not exist",
+                f"{what} is in {quoted(uri)}, which does not exist",
                 "put that file beside the model or embed it in a .glb",
             )
         require_regular_file(path)
@@ -169,8 +167,8 @@ class GltfFile:
             record = self.item(self.document.buffers, index, "buffer")
             content: bytes | memoryview
             if record.uri is not None:
-                place = self.resolve(record.uri, f"buffer {index}")
-                content = self._read_buffer(place, record.byte_length, index) if isinstance(place, Path) else place
+                target = self.resolve(record.uri, f"buffer {index}")
+                content = self._read_buffer(target, record.byte_length, index) if isinstance(target, Path) else target
             elif index == 0 and self._binary is not None:
                 content = self._binary
             else:
@@ -294,4 +292,4 @@ class GltfFile:
 
 def printed(name: str) -> str:
     """Format a name from a file for a message: as it is where it is short and printable, else escaped and cut."""
-    return name if name.isprintable() and len(name) <= 80 else shown(name)
+    return name if name.isprintable() and len(name) <= 80 else quoted(name)

@@ -56,7 +56,7 @@ def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
 
     Raises InputError for indices out of range.
     """
-    parts = vertices = faces = kept = peak = 0
+    parts = vertices = faces = scene_bytes = peak = 0
     flat_corners = 0
     names: set[str] = set()
     meshes: dict[int, list[_PrimitiveSize]] = {}
@@ -72,7 +72,7 @@ def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
             parts += 1
             vertices += size.vertices
             faces += size.faces
-            kept += size.kept
+            scene_bytes += size.scene_bytes
             peak = max(peak, size.temporary + (size.skin if node.skin is not None else 0))
             names |= size.names
             if "NORMAL" not in size.names:
@@ -80,23 +80,23 @@ def predicted_geometry(file: GltfFile, visible: list[int]) -> Geometry:
     # Where only some parts have normals, the others get a vertex for each corner (read._flat_shaded).
     split = flat_corners if "NORMAL" in names else 0
     width = sum(_width(name) for name in names)
-    held = kept + faces * _FACE_BYTES + parts * _PART_BYTES
+    held_bytes = scene_bytes + faces * _FACE_BYTES + parts * _PART_BYTES
     joining = split * width + (vertices + split) * width + faces * _JOINED_FACE_BYTES
-    return Geometry(parts, vertices, faces, held + max(peak, joining))
+    return Geometry(parts, vertices, faces, held_bytes + max(peak, joining))
 
 
 @dataclass(frozen=True)
 class _PrimitiveSize:
     """Count a primitive's vertices and faces, and the bytes that reading it takes.
 
-    names: the attributes that a Scene keeps. kept: bytes of these once it is read. temporary: bytes while it is read,
-    and skin: further bytes where it is skinned.
+    names: the attributes that a Scene holds. scene_bytes: of these once the primitive is read. temporary: bytes while
+    it is read. skin: further bytes where it is skinned.
     """
 
     vertices: int
     faces: int
     names: frozenset[str]
-    kept: int
+    scene_bytes: int
     temporary: int
     skin: int
 
@@ -120,7 +120,7 @@ def _primitive_size(file: GltfFile, primitive: Primitive) -> _PrimitiveSize | No
         vertices=vertices,
         faces=faces,
         names=names,
-        kept=vertices * sum(_width(name) for name in names),
+        scene_bytes=vertices * sum(_width(name) for name in names),
         temporary=count * components * _COMPONENT_BYTES + corners * _CORNER_BYTES,
         skin=count * _SKIN_BYTES,
     )

@@ -1,4 +1,4 @@
-"""The node tree of a glTF file: which nodes the scene shows, where they stand, and how skins move vertices."""
+"""Walk the node tree of a glTF file: which nodes the scene shows, their transforms, and how skins move vertices."""
 
 from __future__ import annotations
 

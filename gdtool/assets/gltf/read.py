@@ -18,11 +18,11 @@ from gdtool.geometry.meshes import TriMesh
 def read_gltf(path: str | Path) -> Scene:
     """Read the default scene of a .glb or .gltf: every triangle of every node, in world space and in rest pose.
 
-    Skins stand as their joints do without animation, morph targets at their default weights. Strips and fans become
-    triangles; points and lines are left out and noted. A primitive without a material gets DEFAULT_MATERIAL.
-
-    Raises InputError with the file and the fault, among them a required extension that gdtool does not know. Raises
-    ResourceError before any geometry is decoded where all of it would take more memory than one input may.
+    Skins take the joints' transforms that the nodes hold, without animation; morph targets their default weights.
+    Strips and fans become triangles; points and lines are left out and noted. A primitive without a material gets
+    DEFAULT_MATERIAL. Raises InputError with the file and the fault, among them a required extension that gdtool does
+    not know. Raises ResourceError before any geometry is decoded where all of it would take more memory than one input
+    may.
     """
     file = GltfFile(Path(path))
     parts: list[MeshPart] = []
@@ -83,7 +83,9 @@ def _joined(file: GltfFile, parts: list[MeshPart]) -> Scene:
 
 
 def _flat_shaded(part: MeshPart) -> MeshPart:
-    """Give each face three vertices of its own with the face's normal, as glTF asks where normals are missing."""
+    """Give each face three vertices that it does not share, with the face's normal, as glTF asks where normals are
+    missing.
+    """
     from gdtool.geometry.normals import face_normals
 
     corner = part.faces.reshape(-1)
@@ -129,10 +131,10 @@ def _common_colors(parts: list[MeshPart]) -> np.ndarray | None:
 
 
 def _common_tangents(file: GltfFile, parts: list[MeshPart], materials: list[Material]) -> np.ndarray | None:
-    """Join tangents (v, 4), any direction across the normal for parts whose material has no normal map.
+    """Join the tangents (v, 4) of all parts; None where no part has tangents, or a part that needs them has none.
 
-    materials: of each part. None where no part has tangents, or one that needs them has none: all are then computed
-    alike by whoever needs them.
+    materials: of each part. A part whose material has no normal map needs no tangents, and gets any direction across
+    the normal. With None the reader of the Scene computes all tangents alike.
     """
     if all(part.tangents is None for part in parts):
         return None

@@ -20,7 +20,7 @@ Vector4 = tuple[float, float, float, float]
 
 
 class Gltf(msgspec.Struct, frozen=True, kw_only=True, rename="camel"):
-    """Base of the types: immutable, with the specification's camelCase names in the file."""
+    """Define the base of the types: immutable, with the specification's camelCase names in the file."""
 
 
 class Asset(Gltf, frozen=True, kw_only=True):

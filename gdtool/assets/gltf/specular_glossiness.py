@@ -24,7 +24,9 @@ _ROWS_AT_ONCE = 64  # converted in float32; a map of 4096² pixels at once would
 
 @dataclass(frozen=True)
 class SpecularGlossinessMaterial:
-    """A material to convert: what both models share, the extension's record and textures, and the file's index."""
+    """Hold a material to convert: what both models share, the extension's record and textures, and its index in the
+    file.
+    """
 
     material: Material
     record: SpecularGlossiness
@@ -34,7 +36,7 @@ class SpecularGlossinessMaterial:
 
 
 def convert(file: GltfFile, source: SpecularGlossinessMaterial) -> Material:
-    """Return the metallic-roughness material that reflects most nearly what a specular-glossiness one does.
+    """Return the metallic-roughness material whose reflection is nearest to that of a specular-glossiness one.
 
     Raises InputError where the two textures are looked up differently, ResourceError for maps that are too large.
     """
@@ -115,7 +117,7 @@ def clipped_rgba(red: float, green: float, blue: float, alpha: float) -> tuple[f
 
 
 def _lookup(texture: Texture) -> tuple:
-    """List the properties of a texture that decide which texel a point of the surface gets."""
+    """List the properties of a texture that decide which texel a point of the surface reads."""
     return texture.uv_set, texture.offset, texture.rotation, texture.scale, texture.wrap_u, texture.wrap_v
 
 
@@ -132,8 +134,8 @@ def _metallic(diffuse: np.ndarray, specular: np.ndarray) -> np.ndarray:
     f0 m² + (k - 2 f0 + s) m + (f0 - s) = 0 with k = d (1 - max s) / (1 - f0). Returns its root in [0, 1].
     """
     f0, d, s = _DIELECTRIC_F0, _brightness(diffuse), _brightness(specular)
-    kept = d * (1 - specular.max(-1)) / (1 - f0)
-    b, c = kept - 2 * f0 + s, f0 - s
+    k = d * (1 - specular.max(-1)) / (1 - f0)
+    b, c = k - 2 * f0 + s, f0 - s
     root = (-b + np.sqrt(np.maximum(b * b - 4 * f0 * c, 0))) / (2 * f0)
     return np.where(s <= f0, 0.0, np.clip(root, 0, 1)).astype(diffuse.dtype)
 

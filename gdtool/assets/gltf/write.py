@@ -41,7 +41,7 @@ def write_glb(
         raise from_os_error(error, path) from None
     if not whole:
         raise OutputError(
-            path, "was not written whole (it reads back otherwise)", "free some space or choose another -o"
+            path, "was not written whole (it reads back differently)", "free some space or choose another -o"
         )
 
 
@@ -88,7 +88,7 @@ def _check(scene: Scene) -> None:
 
 
 class _PrimitiveVertices(NamedTuple):
-    """List the scene's vertices (n,) that a primitive uses, its corners as indices into them, and tangents (n, 4).
+    """Hold the scene's vertices (n,) that a primitive uses, its corners as indices into them, and tangents (n, 4).
 
     Tangents are None where the material needs none. A vertex is listed more than once where the tangents of its faces
     differ.

@@ -113,7 +113,7 @@ def parse_each(text: str, path: Path) -> ObjLines:
                 names.add_line(words, line)
         except (ValueError, IndexError, OverflowError) as error:
             raise InputError(
-                path, f"line {number} is not what OBJ says ({str(error)[:120]})", "correct that line or export it again"
+                path, f"line {number} is not valid OBJ ({str(error)[:120]})", "correct that line or export it again"
             ) from None
     return ObjLines(
         np.array(vertices, np.float64).reshape(-1, 3),
@@ -129,7 +129,7 @@ def parse_each(text: str, path: Path) -> ObjLines:
 
 
 class _Corner(NamedTuple):
-    """Indices of a polygon's corner, counted from 0, -1 where absent."""
+    """Hold the indices of a polygon's corner, counted from 0, -1 where absent."""
 
     vertex: int
     uv: int
@@ -151,11 +151,11 @@ def _corner(word: str, counts: tuple[int, int, int]) -> _Corner:
 
 
 class _NotUniformError(Exception):
-    """Lines of one kind differ in form, or one of them is wrong."""
+    """Report that lines of one kind differ in form, or that one of them is wrong."""
 
 
 class _Payload(NamedTuple):
-    """Lines of one kind: their bytes, keywords blanked, and where each line begins in them."""
+    """Hold the lines of one kind: their bytes, keywords replaced by blanks, and the offset of each line in them."""
 
     text: np.ndarray
     begins: np.ndarray
@@ -199,7 +199,10 @@ def parse_uniform(data: bytes) -> ObjLines | None:
 
 
 def _payload(text: np.ndarray, starts: np.ndarray, ends: np.ndarray, rows: np.ndarray, letters: int) -> _Payload:
-    """Copy the bytes of the lines where rows (lines,) is true, and blank their keywords of so many letters."""
+    """Copy the bytes of the lines where rows (lines,) is true, and replace their keywords by blanks.
+
+    starts, ends (lines,): byte offsets of the lines in text. letters: the length of the keyword.
+    """
     which = np.flatnonzero(rows)
     begins, lengths = starts[which], ends[which] - starts[which] + 1
     if len(which) and which[-1] - which[0] == len(which) - 1:  # consecutive lines
@@ -242,7 +245,10 @@ def _parsed(text: np.ndarray, kind: type, count: int) -> np.ndarray:
 
 
 def _numbers(payload: _Payload, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parse the first `width` numbers of each line (lines, width), and the fourth to sixth (lines, 3), or (0, 3)."""
+    """Parse the first `width` numbers of each line as (lines, width), float64.
+
+    Also returns the fourth to sixth numbers (lines, 3), the colors of vertices, where every line has six; else (0, 3).
+    """
     if not len(payload.begins):
         return np.empty((0, width)), np.empty((0, 3))
     table = _word_table(_words(payload.text), payload.begins)

@@ -22,7 +22,7 @@ Statements = dict[str, list[str]]  # of a material: keyword in lower case to the
 
 
 class _Definition(NamedTuple):
-    """A material of a library: its statements, the .mtl file, and that file's folder relative to the model."""
+    """Hold a material of a library: its statements, the .mtl file, and that file's folder relative to the model."""
 
     statements: Statements
     library: Path
@@ -91,7 +91,7 @@ def _material(name: str, definition: _Definition, textures: _Textures, notes: li
     statements = definition.statements
 
     def numbers(key: str) -> list[float]:
-        """The finite numbers of a statement, none where it is absent or malformed."""
+        """Return the finite numbers of a statement; none where it is absent or malformed."""
         try:
             values = [float(word) for word in statements.get(key, [])]
         except ValueError:
@@ -168,7 +168,7 @@ def _clipped(x: float) -> float:
 
 
 class _Textures:
-    """Read the images of a model's materials, each once; notes gets a line for each that is left out."""
+    """Read the images of a model's materials, each once; notes gets a line for each image that is left out."""
 
     def __init__(self, model: Path, notes: list[str]) -> None:
         self.model, self.notes = model, notes

@@ -51,7 +51,7 @@ def _cut_ears(points: np.ndarray) -> np.ndarray:
         flat = flat * (-1, 1)
 
     def turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-        """Twice the signed area of the triangles a, b, c: positive for a left turn."""
+        """Return twice the signed area of the triangles a, b, c: positive for a left turn."""
         return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
     left = list(range(n))

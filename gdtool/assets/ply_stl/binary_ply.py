@@ -44,7 +44,7 @@ def read_binary_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     start = end + len(b"end_header\n")
     size = counts["vertex"] * vertex_type.itemsize
     if len(data) - start != size + counts["face"] * face_type.itemsize:
-        raise ValueError("has not the length that its header says (faces must be triangles)")
+        raise ValueError("does not have the length that its header says (faces must be triangles)")
     vertex = np.frombuffer(data, vertex_type, counts["vertex"], start)
     face = np.frombuffer(data, face_type, counts["face"], start + size)
     if len(face) and (face["count"] != 3).any():

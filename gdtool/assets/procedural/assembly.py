@@ -14,14 +14,16 @@ from gdtool.assets.scene import Material, Scene
 
 @dataclass(frozen=True)
 class _Placement:
-    """Where a part's vertices lie in the finished scene: (vertices - center) * scale."""
+    """Hold where a part's vertices lie in the finished scene: (vertices - center) * scale."""
 
     center: np.ndarray
     scale: float
 
 
 class _Patch(NamedTuple):
-    """The parts that share a material: a piece of the scene's arrays, faces counted from its first vertex."""
+    """Hold the parts that share a material, as a piece of the scene's arrays; faces count from the piece's first
+    vertex.
+    """
 
     vertices: np.ndarray
     normals: np.ndarray
@@ -106,7 +108,7 @@ def _tiled_uv(part: Part, scale: float, tiles_per_unit: float) -> np.ndarray:
 def convexity(points: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Measure the smoothed mean curvature at each vertex (v,), after welding vertices of equal position.
 
-    About 1 on a sharp convex edge, negative in hollows, clipped to [-1.5, 1.5].
+    It is about 1 on a sharp convex edge and negative in hollows, clipped to [-1.5, 1.5], without a unit.
     """
     _, weld = np.unique(
         np.round(points * 1e6).astype(np.int64) @ np.array([1, 2_097_143, 4_398_016_094_209]), return_inverse=True

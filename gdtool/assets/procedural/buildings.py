@@ -49,7 +49,7 @@ def hip(width: float, height: float, depth: float, overhang: float = 0.05, top: 
 
 
 class Window(NamedTuple):
-    """A window of four panes: size, and finishes of frame and panes."""
+    """Hold a window of four panes: width and height, and the finishes of frame and panes."""
 
     width: float
     height: float

@@ -25,7 +25,7 @@ from gdtool.assets.scene import Material, Texture, Wrap
 class Shape:
     """Hold the surface that a finish is applied to, in the normalised object: points (v, 3), normals (v, 3).
 
-    convexity() computes (v,), positive on outward edges; see assembly.convexity.
+    convexity() returns (v,), the curvature of assembly.convexity, positive on outward edges.
     """
 
     points: np.ndarray

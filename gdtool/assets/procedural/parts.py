@@ -95,10 +95,10 @@ def _crease_flags(quads: np.ndarray, axis: int, wraps: bool, cosine: float) -> n
     area = np.linalg.norm(quads, axis=-1)
     area = np.minimum(area, np.roll(area, 1, axis))
     cosines = np.where(area > 1e-12, cosines, np.nan)
-    known = np.isfinite(cosines).any(axis=1 - axis)
+    has_area = np.isfinite(cosines).any(axis=1 - axis)
     flags = np.zeros(quads.shape[axis] + 1, bool)
-    median = np.ones(len(known))
-    median[known] = np.nanmedian(np.compress(known, cosines, axis=axis), axis=1 - axis)
+    median = np.ones(len(has_area))
+    median[has_area] = np.nanmedian(np.compress(has_area, cosines, axis=axis), axis=1 - axis)
     flags[:-1] = median < cosine
     flags[-1] = flags[0]
     if not wraps:
@@ -152,8 +152,8 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
         corner_welded.append(np.where(pole[wrapped], wrapped * columns, wrapped * columns + c % columns))
     _, first, inverse = np.unique(np.stack(corner_keys).reshape(-1), return_index=True, return_inverse=True)
     corner = inverse.reshape(4, strips, columns)
-    place = np.stack(corner_points).reshape(-1, 2)[first]
-    vertices = points[place[:, 0] % row_count, place[:, 1] % columns]
+    grid_idx = np.stack(corner_points).reshape(-1, 2)[first]
+    vertices = points[grid_idx[:, 0] % row_count, grid_idx[:, 1] % columns]
     normals = unit(np.stack(corner_normals).reshape(-1, 3)[first])
 
     triangles = []
@@ -169,7 +169,7 @@ def grid_part(points: np.ndarray, closed: bool = False, crease_degrees: float = 
     length_v = np.linalg.norm(np.diff(ring, axis=0), axis=-1).max(axis=1)
     u = np.r_[0.0, np.cumsum(widest)] / max(widest.sum(), 1e-12)
     v = np.r_[0.0, np.cumsum(length_v)] / max(length_v.sum(), 1e-12)
-    uv = np.stack([u[place[:, 1]], 1.0 - v[place[:, 0]]], -1)
+    uv = np.stack([u[grid_idx[:, 1]], 1.0 - v[grid_idx[:, 0]]], -1)
     if signed_volume(vertices, faces) < 0:
         faces, normals = np.ascontiguousarray(faces[:, ::-1]), -normals
         uv[:, 0] = 1.0 - uv[:, 0]
@@ -203,7 +203,10 @@ def circle(count: int = 40) -> np.ndarray:
 
 
 def rectangle(width: float, depth: float, subdivisions: int = 6) -> np.ndarray:
-    """Make the outline (n, 2) of a rectangle about the origin; sides are subdivided: field finishes need vertices."""
+    """Make the outline (n, 2) of a rectangle about the origin, with each side cut into `subdivisions` pieces.
+
+    Finishes of solid fields look their pattern up at vertices, so a side needs several.
+    """
     corners = 0.5 * np.array([[width, -depth], [width, depth], [-width, depth], [-width, -depth]])
     return subdivided(corners, subdivisions)
 

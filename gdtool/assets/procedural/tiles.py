@@ -257,7 +257,7 @@ THEMES = {
 def pick(rng: np.random.Generator, theme: str = "any", color: np.ndarray | None = None) -> Finish:
     """Draw a finish of a theme, in the given colour if any; metals keep a metal's colour.
 
-    The finish gets a random stream of its own, so that its details do not change what is drawn after it.
+    The finish gets a random generator of its own, so that the details of a finish do not change what is drawn after it.
     """
     choices = THEMES[theme]
     chosen = choices[rng.integers(len(choices))]

@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 from gdtool.core.errors import InputError, ResourceError, from_os_error
 from gdtool.core.folder import Folder, open_folder
-from gdtool.core.names import CURE, name_fault, path_inside, relative_parts, shown
+from gdtool.core.names import CURE, name_fault, path_inside, quoted, relative_parts
 from gdtool.core.reading import require_regular_file
 
 MANIFEST = "manifest.json"
@@ -93,7 +93,7 @@ def unpack_views(archive: Path, workspace: Path) -> Iterator[Folder]:
                     raise ResourceError(
                         archive,
                         f"would unpack more than {MAX_OBJECT_MEMBERS:,} files or {MAX_OBJECT_BYTES >> 30} GiB "
-                        f"for {shown(name)}",
+                        f"for {quoted(name)}",
                         "render fewer or smaller views of one object",
                     )
                 target = path_inside(
@@ -172,7 +172,7 @@ def _members(archive: Path, tar: tarfile.TarFile) -> Iterator[tarfile.TarInfo]:
         tar.members.clear()  # tarfile keeps each header otherwise
         if member.issparse():
             raise InputError(
-                archive, f"holds the sparse file {shown(member.name)}", "pack it again without sparse files"
+                archive, f"holds the sparse file {quoted(member.name)}", "pack it again without sparse files"
             )
         count, size = count + 1, size + member.size + tarfile.BLOCKSIZE
         if count > MAX_MEMBERS:
@@ -199,7 +199,7 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
         out = target.open("wb")
     except OSError as error:
         if isinstance(error, (FileExistsError, NotADirectoryError, IsADirectoryError)):
-            raise InputError(archive, f"holds {shown(member.name)} both as a file and as a folder", _PACK) from None
+            raise InputError(archive, f"holds {quoted(member.name)} both as a file and as a folder", _PACK) from None
         raise from_os_error(error, target) from None
     with out:
         with _as_input_error(archive):
@@ -209,7 +209,7 @@ def _unpack(archive: Path, tar: tarfile.TarFile, member: tarfile.TarInfo, target
             with _as_input_error(archive):
                 block = source.read(min(left, _BLOCK))
             if not block:
-                raise InputError(archive, f"is not a whole tar file (it ends within {shown(member.name)})", _PACK)
+                raise InputError(archive, f"is not a whole tar file (it ends within {quoted(member.name)})", _PACK)
             try:
                 out.write(block)
             except OSError as error:
@@ -222,7 +222,7 @@ def _object_folder(root: Path, name: str, archive: Path) -> Path:
     safe = archive.stem if name == "." else name.replace("/", "_").replace("..", "_")
     fault = name_fault(safe, byte_escapes=True)
     if fault:
-        raise InputError(archive, f"object {shown(name)} {fault}", CURE)
+        raise InputError(archive, f"object {quoted(name)} {fault}", CURE)
     return root / safe / "views"
 
 
@@ -231,6 +231,6 @@ def _open_object(archive: Path, root: Path, name: str) -> Folder:
     folder = _object_folder(root, name, archive)
     if not (folder / MANIFEST).is_file():
         raise InputError(
-            archive, f"has {shown(name)} in pieces, or without its manifest", "pack each views folder as one"
+            archive, f"has {quoted(name)} in pieces, or without its manifest", "pack each views folder as one"
         )
     return open_folder(folder, ("views",), "train", check=False)

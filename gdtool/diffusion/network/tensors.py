@@ -81,7 +81,7 @@ def require_weights_fit(size: int, subject: object, what: str) -> None:
 
     subject, what: the file and the quantity that the error names.
     """
-    most = memory.most_held() / memory.SHARE
+    most = memory.max_input_bytes() / memory.SHARE
     if size > most:
         raise ResourceError(
             subject,

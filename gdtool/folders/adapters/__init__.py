@@ -36,16 +36,16 @@ class Pictures:
 
 def adapter(folder: Path, name: str = "auto") -> ModuleType:
     """Return the adapter of a name, or the first one that recognises the folder. Raises InputError."""
-    for known in ADAPTERS if name == "auto" else (name,):
-        module = import_module(f"{__name__}.{known}")
+    for module_name in ADAPTERS if name == "auto" else (name,):
+        module = import_module(f"{__name__}.{module_name}")
         if module.recognises(folder):
             return module
-    wanted = (
+    expected = (
         "a Wonder3D output, a transforms.json or a cameras.json with pictures"
         if name == "auto"
         else import_module(f"{__name__}.{name}").LOOKS_LIKE
     )
-    raise InputError(folder, f"does not hold {wanted}", "name the folder that holds it")
+    raise InputError(folder, f"does not hold {expected}", "name the folder that holds it")
 
 
 def linear_color(image: np.ndarray) -> np.ndarray:
@@ -71,7 +71,7 @@ def stacked(parts: list[np.ndarray], paths: list[Path]) -> np.ndarray:
     return np.stack(parts)
 
 
-def without_traces(mask: np.ndarray) -> np.ndarray:
+def zero_faint_coverage(mask: np.ndarray) -> np.ndarray:
     """Set coverage (k, h, w) below half a step of 8-bit storage to 0."""
     return np.where(mask > MIN_COVERAGE, mask, 0).astype(np.float32)
 

@@ -10,7 +10,7 @@ import numpy as np
 from gdtool.cameras import Camera
 from gdtool.core.errors import InputError
 from gdtool.core.memory import require_memory
-from gdtool.core.names import shown, uri_path
+from gdtool.core.names import quoted, uri_path
 from gdtool.core.reading import read_json
 from gdtool.core.references import is_readable
 from gdtool.folders.adapters import Pictures, linear_color, stacked
@@ -18,7 +18,7 @@ from gdtool.folders.adapters import Pictures, linear_color, stacked
 LOOKS_LIKE = "a transforms.json"
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".exr")  # Blender's exporter leaves the suffix out
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-# Of a size or a focal length that can be meant; the latter also of what a matrix holds.
+# Bounds of sizes and focal lengths in pixels, far beyond any camera. The upper bound also holds for matrix entries.
 _LEAST_PIXELS, _MOST_PIXELS = 1e-3, 1e9
 _FILES = ("transforms.json", "transforms_train.json")
 
@@ -68,10 +68,10 @@ def read(folder: Path) -> Pictures:
 def _picture(path: Path, name: str) -> Path:
     """Return the path of the picture that a file_path names, within the folder. Raises InputError."""
     for suffix in _SUFFIXES:
-        found = uri_path(path.parent, name + suffix, path, "file_path")
-        if is_readable(found):
-            return found
-    raise InputError(path, f"file_path {shown(name)} does not exist", "put the picture there or correct the file_path")
+        candidate = uri_path(path.parent, name + suffix, path, "file_path")
+        if is_readable(candidate):
+            return candidate
+    raise InputError(path, f"file_path {quoted(name)} does not exist", "put the picture there or correct the file_path")
 
 
 def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: int) -> Camera:
@@ -128,7 +128,10 @@ def _camera(path: Path, record: dict[str, Any], name: str, width: int, height: i
 
 
 def _matrix(rows: Any) -> np.ndarray | None:
-    """Convert nested lists to (3 or 4, 4) float64; None for another shape or numbers beyond _MOST_PIXELS."""
+    """Convert nested lists to a matrix (3 or 4, 4) float64.
+
+    Returns None for another shape, and for values that are not finite or too large to be meant (above _MOST_PIXELS).
+    """
     if (
         not isinstance(rows, list)
         or len(rows) not in (3, 4)

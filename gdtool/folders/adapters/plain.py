@@ -92,17 +92,17 @@ def read(folder: Path) -> Pictures:
 
 def _find(folder: Path, domain: str, view: str) -> Path | None:
     """Find the picture of a view in a domain; None where there is none."""
-    places = [f"{domain}/"] + ([""] if domain == "color" else [])
-    for place in places:
+    prefixes = [f"{domain}/"] + ([""] if domain == "color" else [])
+    for prefix in prefixes:
         for suffix in _SUFFIXES:
-            path = path_inside(folder, f"{place}{view}{suffix}", folder / "cameras.json", "picture")
+            path = path_inside(folder, f"{prefix}{view}{suffix}", folder / "cameras.json", "picture")
             if is_readable(path):
                 return path
     return None
 
 
 def _size(path: Path, camera, image: np.ndarray) -> tuple[int, int]:
-    """Return the height and width of a picture. Raises InputError where its camera has others."""
+    """Return the height and width of a picture in pixels. Raises InputError where its camera has another size."""
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(
             path,

@@ -34,7 +34,7 @@ class SphericalGaussians:
 
     @classmethod
     def from_record(cls, light: dict, dtype: torch.dtype = torch.float32) -> SphericalGaussians:
-        """Read the lobes of a light.json record, as folders.records.read_record returns it."""
+        """Read the lobes of a light.json record, as folders.records.read_light returns it."""
         return cls(*(torch.as_tensor(light[name], dtype=dtype) for name in ("axes", "sharpness", "amplitudes")))
 
 

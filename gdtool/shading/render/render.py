@@ -170,7 +170,7 @@ class Renderer:
         origin = origins[active].astype(np.float64)
         for _ in range(MAX_LAYERS):
             hits = self.tested_caster.first_hit(origin, directions[active])
-            hit = hits.found
+            hit = hits.is_hit
             active, origin = active[hit], origin[hit]
             if not len(active):
                 break

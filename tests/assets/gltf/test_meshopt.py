@@ -7,7 +7,7 @@ import pytest
 
 from gdtool.assets.gltf.read import read_gltf
 from gdtool.core.errors import InputError
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder
 
 meshopt = pytest.importorskip("meshopt", reason="the extra codecs is not installed")
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gdtool.assets.gltf.read import read_gltf
-from tests.assets.gltf_files import quad, with_textures
+from tests.assets.gltf.files import quad, with_textures
 
 
 def test_every_material_property_is_read(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 
 from gdtool.assets.load import load_scene
 from gdtool.core.errors import InputError, ResourceError
-from tests.assets.gltf_files import QUAD, Builder, pack, quad, with_textures
+from tests.assets.gltf.files import QUAD, Builder, pack, quad, with_textures
 
 
 def edited(change) -> bytes:

@@ -16,7 +16,7 @@ from gdtool.assets.gltf.write import glb_bytes, write_glb
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.core.errors import OutputError
 
-TOOLS = Path(__file__).parents[1] / "tools"
+TOOLS = Path(__file__).parents[2] / "tools"
 
 
 def pixels(channels: int, seed: int = 0) -> np.ndarray:
@@ -82,15 +82,17 @@ def test_a_written_scene_is_read_back(tmp_path):
     scene = full_scene()
     write_glb(tmp_path / "both.glb", scene)
     back = read_gltf(tmp_path / "both.glb")
-    corner, again = scene.faces.ravel(), back.faces.ravel()
-    np.testing.assert_allclose(back.vertices[again], scene.vertices[corner])
-    np.testing.assert_allclose(back.normals[again], scene.normals[corner])
+    corner, read_back = scene.faces.ravel(), back.faces.ravel()
+    np.testing.assert_allclose(back.vertices[read_back], scene.vertices[corner])
+    np.testing.assert_allclose(back.normals[read_back], scene.normals[corner])
     np.testing.assert_allclose(
         back.tangents[back.faces[:2]].reshape(-1, 4), scene.tangents[scene.faces[:2]].reshape(-1, 4)
     )
-    np.testing.assert_allclose(back.colors[again], scene.colors[corner], atol=1e-7)
-    np.testing.assert_allclose(back.uvs[0][again], scene.uvs[0][corner], atol=1e-7)
-    np.testing.assert_allclose(back.uvs[1][again], scene.uvs[2][corner], atol=1e-7)  # sets are numbered without gaps
+    np.testing.assert_allclose(back.colors[read_back], scene.colors[corner], atol=1e-7)
+    np.testing.assert_allclose(back.uvs[0][read_back], scene.uvs[0][corner], atol=1e-7)
+    np.testing.assert_allclose(
+        back.uvs[1][read_back], scene.uvs[2][corner], atol=1e-7
+    )  # sets are numbered without gaps
     painted, plain = back.materials
     assert plain == scene.materials[2]
     for name in (

@@ -12,7 +12,7 @@ from gdtool.shading.lights.environment import Environment
 from gdtool.shading.render.direct import DirectLight, LightOptions
 from gdtool.shading.render.render import Renderer, render_buffers
 from gdtool.shading.render.surface_points import surface_attributes
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad, with_textures
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, quad, with_textures
 
 CORNER = np.array([0]), np.array([[1.0, 0.0, 0.0]])
 PIXELS = np.arange(4 * 4 * 3, dtype=np.uint8).reshape(4, 4, 3) * 5

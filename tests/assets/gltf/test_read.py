@@ -11,11 +11,11 @@ from gdtool.assets.load import load_scene
 from gdtool.assets.scene import DEFAULT_MATERIAL
 from gdtool.core.errors import InputError, ResourceError
 from gdtool.images.io import encode_png
-from tests.assets.gltf_files import QUAD, QUAD_FACES, Builder, quad
+from tests.assets.gltf.files import QUAD, QUAD_FACES, Builder, quad
 
 
 def area_vector(scene) -> np.ndarray:
-    """Sum the area vectors of the faces: the direction a flat shape faces, times its area."""
+    """Sum the area vectors of the faces: for a flat shape the direction that it faces, times its area."""
     a, b, c = (scene.vertices[scene.faces[:, i]] for i in range(3))
     return np.cross(b - a, c - a).sum(0) / 2
 
