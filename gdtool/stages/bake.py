@@ -159,7 +159,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
 
 STAGE = Stage(
     name="bake",
-    version=13,
+    version=14,
     reads=("atlas", "mesh-file"),
     networks=True,
     writes="asset",

@@ -176,7 +176,7 @@ def _write(
 
 STAGE = Stage(
     name="reconstruct",
-    version=18,
+    version=19,
     reads=("views",),
     writes="surface",
     Options=Options,

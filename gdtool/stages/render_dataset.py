@@ -179,7 +179,7 @@ def _record_skips(out: Output, renderer: Renderer, options: Options, lamps: Prep
 
 STAGE = Stage(
     name="render-dataset",
-    version=7,
+    version=8,
     reads=("model-file", "asset"),
     writes="views",
     Options=Options,
