@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: venv demo test lint lint-known stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-picture bench-sample bench-model schemas docs-check model data clean
+.PHONY: venv demo test lint style lint-known stress extras-test fuzz bench bench-assets bench-materials bench-reconstruct bench-render bench-relight bench-sheets bench-throughput bench-cutout bench-picture bench-sample bench-model schemas docs-check model data clean
 
 venv: .venv/.done
 
@@ -21,10 +21,12 @@ test: venv
 
 # Layout and types. mypy may find nothing new: tests/mypy_baseline.txt lists what is known, `make lint-known` writes it again, shorter.
 LINTED := gdtool commands tests benchmarks examples
-lint: venv
+lint: style
+	$(BIN)/mypy | $(BIN)/mypy-baseline filter
+
+style: venv
 	$(BIN)/ruff check $(LINTED)
 	$(BIN)/ruff format --check $(LINTED)
-	$(BIN)/mypy | $(BIN)/mypy-baseline filter
 
 lint-known: venv
 	$(BIN)/mypy | $(BIN)/mypy-baseline sync
