@@ -73,7 +73,7 @@ MATERIALS = {
 def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
     """The plain estimate is unbiased; the one that is used for glTF's Lambert, the known irradiance times the visible
     share, is a ratio of two estimates, off by up to 0.1 % where a pixel is half in shadow."""
-    renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).shrunk(64)
+    renderer, environment = Renderer(stage(MATERIALS[material]), 1), bundled(light).downsampled(64)
     reference = [picture(renderer, environment, 1000 + k, 1024, brdf, control_variate=False) for k in range(4)]
     error = np.std(reference, 0, ddof=1) / 2
     draws = np.stack([picture(renderer, environment, seed, 16, brdf, control_variate=known) for seed in range(DRAWS)])
@@ -82,7 +82,7 @@ def test_sampled_light_agrees_with_the_converged(material, light, brdf, known):
 
 def test_the_test_finds_a_bias_of_two_percent():
     """The same statistic of an estimate that is 2 % too bright fails; of one that is not, it passes."""
-    renderer, environment = Renderer(stage(MATERIALS["plaster"]), 1), bundled("mid").shrunk(32)
+    renderer, environment = Renderer(stage(MATERIALS["plaster"]), 1), bundled("mid").downsampled(32)
     draws = np.stack([picture(renderer, environment, seed, 8) for seed in range(8)])
     reference = picture(renderer, environment, 99, 256)
     spread = 0.25 * draws.std(0, ddof=1)
