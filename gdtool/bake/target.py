@@ -58,9 +58,17 @@ def corner_normals(mesh: TriMesh, crease_degrees: float = CREASE_DEGREES) -> np.
 class SurfaceModes(Protocol):
     """The glTF material settings alpha mode, alpha cutoff and double-sided; bake.origin.Origin has them."""
 
-    alpha_mode: str
-    alpha_cutoff: float
-    double_sided: bool
+    @property
+    def alpha_mode(self) -> str:
+        """OPAQUE, MASK or BLEND."""
+
+    @property
+    def alpha_cutoff(self) -> float:
+        """Alpha at or above which MASK shows a texel, 0 to 1."""
+
+    @property
+    def double_sided(self) -> bool:
+        """Whether faces are seen from both sides."""
 
 
 class CornerNormals(NamedTuple):
