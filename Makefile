@@ -31,8 +31,9 @@ style: venv
 lint-known: venv
 	$(BIN)/mypy | $(BIN)/mypy-baseline sync
 
+# With ASSETS also over its meshes (see bench-assets).
 stress: venv
-	$(BIN)/python -m pytest -m slow
+	$(if $(ASSETS),GDTOOL_MESHES=$(ASSETS)/mesh )$(BIN)/python -m pytest -m slow
 
 # What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, onnxruntime, TensorBoard.
 extras-test: venv

@@ -1,8 +1,7 @@
-"""Meshes that break things: each is remeshed and unwrapped, or refused in one line; nothing hangs, crashes or loses
-what was there.
+"""Remesh and unwrap meshes that break things: each is finished, or refused in one line, and nothing hangs or crashes.
 
-The public meshes of SHARED (../shared/assets/mesh unless GDTOOL_MESHES names another folder) run where they are
-present."""
+GDTOOL_MESHES names a folder of public meshes to run as well; without it their tests are skipped.
+"""
 
 import os
 from pathlib import Path
@@ -15,8 +14,8 @@ from gdtool.folders.mesh import read_mesh
 from gdtool.geometry import topology
 from tests.geometry.solids import bored_box, cube, joined, sphere, write_obj
 
-SHARED = Path(os.environ.get("GDTOOL_MESHES", Path(__file__).parents[3] / "shared/assets/mesh"))
-PUBLIC = sorted(p for p in SHARED.rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl")) if SHARED.is_dir() else []
+MESHES = os.environ.get("GDTOOL_MESHES", "")
+PUBLIC = sorted(p for p in Path(MESHES).rglob("*") if p.suffix.lower() in (".obj", ".ply", ".stl")) if MESHES else []
 slow = pytest.mark.slow
 
 
