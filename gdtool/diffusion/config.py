@@ -201,7 +201,9 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     pbr_weight: Weight = 0.1
     pbr_snr: Weight = 1.0  # the rendering loss applies where the SNR is above this
     pbr_pixels: Annotated[int, Meta(ge=1, le=10**9)] = 768  # shaded for each object by the rendering loss
-    precision: Literal["float32", "bfloat16"] = "bfloat16"
+    # Number format of the network and of the optimiser's matrix products. "auto" chooses the one that is faster on the
+    # machine (training/arithmetic.py). Weights, moments, lighting and geometry are float32 in any case.
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
 
 
 PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {

@@ -14,7 +14,7 @@ from gdtool.diffusion.config import ABLATIONS, PRESETS, ModelConfig, TrainConfig
 
 
 def configuration(
-    preset: str, ablation: str, file: str | None, values: Mapping[str, int], size: int | None
+    preset: str, ablation: str, file: str | None, values: Mapping[str, int | str], size: int | None
 ) -> tuple[ModelConfig, TrainConfig]:
     """Build the configurations of a preset, changed by an ablation, then by a file, then by values.
 

@@ -20,6 +20,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from gdtool.core import log
 from gdtool.core.errors import UsageError
 from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
 
@@ -67,6 +68,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         | None
     ) = None
     batch: Annotated[int, Meta(ge=1, le=65536, description="Objects per step; without it the preset's.")] | None = None
+    precision: Annotated[
+        Literal["auto", "float32", "bfloat16"],
+        Meta(description="Number format of the network's products; auto: the faster one on this machine."),
+    ] = "auto"
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of weights, data order and noise.")] = 0
     held_out: Annotated[
         int,
@@ -116,11 +121,14 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.data.sources import count_views_folders, views_folders
     from gdtool.diffusion.reports.record import Recorder, write_results
     from gdtool.diffusion.training import distributed
+    from gdtool.diffusion.training.arithmetic import with_arithmetic
     from gdtool.diffusion.training.loop import RunOptions
     from gdtool.diffusion.training.worker import Order, execute
 
     torch.set_num_threads(out.threads)
     model_config, train_config = configured(options)
+    train_config, arithmetic = with_arithmetic(train_config, out.device)
+    log.say(f"  training in {arithmetic.precision}: {arithmetic.reason}")
     with out.step("decode"):
         folders, count = views_folders(inputs.on_disk, out.workspace), count_views_folders(inputs.on_disk)
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
@@ -171,7 +179,8 @@ def configured(options: Options):
 
     # Without --steps the minutes decide when the training ends.
     steps = MOST_STEPS if options.minutes is not None and options.steps is None else options.steps
-    flags = {"steps": steps, "batch": options.batch}
+    precision = None if options.precision == "auto" else options.precision
+    flags = {"steps": steps, "batch": options.batch, "precision": precision}
     values = {name: value for name, value in flags.items() if value is not None}
     return configuration(options.preset, options.ablation, options.config, values, options.size)
 

@@ -34,6 +34,7 @@ from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training import distributed
+from gdtool.diffusion.training.arithmetic import with_arithmetic
 from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, image_error, rendering_error, view_directions
 from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
@@ -359,7 +360,10 @@ def run_training(
     The first process writes workspace/loss.csv and passes each row to observers.log. A step whose gradient is not
     finite is skipped with a warning. Raises InputError after MOST_SKIPPED such steps in a row.
     """
-    identity = msgspec.json.encode([model.config, train, options.seed, len(objects)]).decode()
+    # A run may go on on another machine, whose faster format is another.
+    anywhere = msgspec.structs.replace(train, precision="auto")
+    identity = msgspec.json.encode([model.config, anywhere, options.seed, len(objects)]).decode()
+    train, _ = with_arithmetic(train, options.device)
     torch.manual_seed(options.seed)
     state = new_state(model.to(options.device).train(), train)
     state.average = {name: x.to(options.device) for name, x in state.average.items()}
@@ -401,7 +405,7 @@ def _warn_skipped(state: State, warn: Callable[[str], None]) -> None:
         raise InputError(
             "training",
             f"has a gradient that is not finite in {MOST_SKIPPED} steps up to {state.step}",
-            "lower learning_rate, or set precision to float32, in the configuration; the checkpoint has finite weights",
+            "lower learning_rate, or use --precision float32; the checkpoint has finite weights",
         )
     if state.skipped:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")

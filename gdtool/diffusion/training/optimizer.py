@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gdtool.core.errors import ResourceError, UsageError
+from gdtool.core.errors import UsageError
 from gdtool.diffusion.config import TrainConfig
 from gdtool.diffusion.training import distributed
 
@@ -20,56 +20,80 @@ FIRST_AND_LAST_LAYERS = (
 )
 MOMENTS = ("step", "exp_avg", "exp_avg_sq", "momentum_buffer")
 MIN_MUON_SIDE = 32  # least rows and columns of a matrix that Muon trains
+# Muon's constants, from Jordan et al. 2024: the quintic polynomial that takes singular values toward 1, how often it is
+# applied, and the momentum. The step is scaled to AdamW's usual size (Liu et al. 2025, "Muon is scalable").
+POLYNOMIAL = (3.4445, -4.7750, 2.0315)
+ITERATIONS = 5
+MOMENTUM = 0.95
+ADAM_RMS = 0.2
+
+
+def orthogonalise(matrix: torch.Tensor, dtype: torch.dtype) -> torch.Tensor:
+    """Make the singular values of a matrix (m, n) about 1, computing in dtype.
+
+    Newton-Schulz iteration with POLYNOMIAL, after which they lie between about 0.7 and 1.2. Returns dtype.
+    """
+    a, b, c = POLYNOMIAL
+    wide = matrix.to(dtype)
+    if matrix.shape[0] > matrix.shape[1]:
+        wide = wide.T
+    wide = wide / wide.norm().clamp(min=1e-7)
+    for _ in range(ITERATIONS):
+        gram = wide @ wide.T
+        wide = torch.addmm(wide, torch.addmm(gram, gram, gram, beta=b, alpha=c), wide, beta=a)
+    return wide.T if matrix.shape[0] > matrix.shape[1] else wide
 
 
 class MuonAndAdam:
-    """Combine torch.optim.Muon (Jordan et al. 2024) and AdamW in one optimiser.
+    """Combine Muon (Jordan et al. 2024) for matrices and AdamW for the rest in one optimiser.
 
     matrices: parameters that Muon trains; a convolution is the matrix (outputs, inputs · taps). rest: parameter groups
-    that AdamW trains. Muon's step is scaled to AdamW's usual size, so one learning rate serves both.
+    that AdamW trains. Muon's step is scaled to AdamW's usual size, so one learning rate serves both. It replaces
+    torch.optim.Muon, which always orthogonalises in bfloat16: on processors without bfloat16 units that is eleven times
+    slower than float32 and took twelve of the fourteen core-seconds of a step.
     """
 
     def __init__(self, matrices: list, rest: list[dict], train: TrainConfig):
-        if not hasattr(torch.optim, "Muon"):
-            raise ResourceError("muon", f"is not in torch {torch.__version__}", "use 2.11 or later, or optimizer adamw")
+        self.dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
+        self.momentum: dict[torch.Tensor, torch.Tensor] = {}
         self.matrices = matrices
-        self.flat = [torch.nn.Parameter(p.detach().view(p.shape[0], -1)) for p in matrices]  # the same memory
-        self.muon = torch.optim.Muon(
-            self.flat, lr=1.0, weight_decay=train.weight_decay, momentum=0.95, adjust_lr_fn="match_rms_adamw"
-        )
+        self.group = {"params": matrices, "lr": 1.0, "weight_decay": train.weight_decay, "rate": 1.0}
         self.adam = torch.optim.AdamW(rest, lr=1.0, betas=train.betas, fused=True)
-        for group in self.muon.param_groups:
-            group["rate"] = 1.0
-        self.param_groups = self.muon.param_groups + self.adam.param_groups
+        self.param_groups = [self.group, *self.adam.param_groups]
 
     @property
     def state(self) -> dict:
         """Map the network's parameters to their moments, as the state of a torch optimiser does."""
-        matrix_state = {
-            p: self.muon.state[flat]
-            for p, flat in zip(self.matrices, self.flat, strict=True)
-            if flat in self.muon.state
-        }
-        return {**self.adam.state, **matrix_state}
+        return {**self.adam.state, **{p: {"momentum_buffer": moment} for p, moment in self.momentum.items()}}
 
     def restore(self, p: torch.Tensor, moments: dict[str, torch.Tensor]) -> None:
         """Set a parameter's moments to those of a checkpoint."""
-        for matrix, flat in zip(self.matrices, self.flat, strict=True):
-            if matrix is p:
-                self.muon.state[flat] = moments
-                return
-        self.adam.state[p] = moments
+        if any(p is matrix for matrix in self.matrices):
+            self.momentum[p] = moments["momentum_buffer"].view(p.shape[0], -1)
+        else:
+            self.adam.state[p] = moments
 
     def step(self) -> None:
         """Take one step of both optimisers."""
-        for p, flat in zip(self.matrices, self.flat, strict=True):
-            flat.grad = None if p.grad is None else p.grad.reshape(flat.shape)
-        self.muon.step()
+        for p in self.matrices:
+            if p.grad is not None:
+                self._step_matrix(p)
         self.adam.step()
+
+    @torch.no_grad()
+    def _step_matrix(self, p: torch.Tensor) -> None:
+        """Move one matrix along its orthogonalised Nesterov momentum."""
+        gradient, rate = p.grad.reshape(p.shape[0], -1), self.group["lr"]
+        moment = self.momentum.setdefault(p, torch.zeros_like(gradient))
+        moment.lerp_(gradient, 1 - MOMENTUM)
+        direction = orthogonalise(gradient.lerp(moment, MOMENTUM), self.dtype)
+        p.mul_(1 - rate * self.group["weight_decay"])
+        scale = ADAM_RMS * max(gradient.shape) ** 0.5
+        p.add_(direction.to(p.dtype).reshape(p.shape), alpha=-rate * scale)
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Clear all gradients."""
-        for p in (*self.matrices, *self.flat):
+        for p in self.matrices:
             p.grad = None
         self.adam.zero_grad(set_to_none=set_to_none)
 
