@@ -31,6 +31,19 @@ MAX_LEVELS = 8  # resolutions of the UNet
 ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
 
 
+class ShapeConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Describe the network that predicts a volume of occupancies from the picture (gdtool/diffusion/shape)."""
+
+    channels: Annotated[tuple[Width, ...], Meta(min_length=1, max_length=MAX_LEVELS)] = (64, 128, 192)
+    layers_per_block: Layers = 2
+    attention_side: Pixels = 12  # levels whose features have this side at most have attention
+    head_width: Width = 64
+    norm_groups: Width = 16
+    embedding: Width = 128  # channels of the embedding of the code
+    code: Annotated[int, Meta(ge=1, le=1024)] = 16  # numbers that tell which of the possible shapes is meant
+    prior_width: Width = 256  # of the hidden layers of the diffusion model of codes
+
+
 class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Describe the network, its inputs and its noise. Sizes are in pixels unless a comment says otherwise."""
 
@@ -64,6 +77,9 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     # attention across the images of an object
     multi_view: bool = True
     row_attention: tuple[bool, ...] = ()  # levels with attention along the rows that the views share; (): none
+    # "images": each domain of a view is an image of its own, as in the paper, and attention joins them. "channels": the
+    # domains of a view are channels of one image, at a sixth of the cost; patch codec only.
+    domain_layout: Literal["images", "channels"] = "images"
     # attention in a star around color, or Wonder3D's over all domains of a view, in the middle or at the end of a block
     cross_domain: Literal["none", "one_way", "two_way", "joint", "joint_last"] = "two_way"
     # class labels and cameras: gdtool's, or Wonder3D's published numbers
@@ -88,6 +104,8 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     sampling_mirrored: bool = False
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: Annotated[tuple[Literal["white", "grey", "black"], ...], Meta(min_length=1)] = ("grey",)
+    # Network that predicts the shape first; the views are then painted onto its renderings. None: no such network.
+    shape: ShapeConfig | None = None
     # source of the pretrained parts of the paper's configuration: a local folder or a hub id
     pretrained: str = ""
     revision: str = ""  # branch, tag or commit of a hub id; "": its main branch
@@ -133,6 +151,8 @@ def _fault(config: ModelConfig) -> str | None:
         heads = config.heads or max(width // config.head_width, 1)
         if attends and width % heads:
             return f"channels[{i}] is {width}, not a multiple of its {heads} heads (heads, head_width)"
+    if config.domain_layout == "channels" and (config.codec != "patch" or config.convention != "gdtool"):
+        return 'domain_layout "channels" needs codec "patch" and convention "gdtool"'
     if config.encoder == "patch":
         if config.image_size % config.encoder_patch:
             return f"image_size is {config.image_size}, not a multiple of encoder_patch {config.encoder_patch}"
@@ -142,6 +162,26 @@ def _fault(config: ModelConfig) -> str | None:
                 f"encoder_width is {config.encoder_width}, not a multiple of its {heads} heads "
                 f"of {ENCODER_HEAD_WIDTH} channels"
             )
+    return _shape_fault(config.shape, config) if config.shape is not None else None
+
+
+def _shape_fault(shape: ShapeConfig, config: ModelConfig) -> str | None:
+    """Describe the first field of a shape network that does not fit the model; None where all fit."""
+    if config.domain_layout != "channels":
+        return 'a shape network needs domain_layout "channels"'
+    if "front" not in config.views:
+        return "a shape network needs the view front"
+    levels = len(shape.channels)
+    multiple = 2 ** (levels + 2)  # three quarters of the image, folded by two, halved from level to level
+    if config.image_size % multiple:
+        return f"image_size is {config.image_size}, not a multiple of {multiple} for {levels} levels of shape"
+    for i, width in enumerate(shape.channels):
+        if width % shape.norm_groups:
+            return f"shape.channels[{i}] is {width}, not a multiple of norm_groups {shape.norm_groups}"
+        if width % max(width // shape.head_width, 1):
+            return f"shape.channels[{i}] is {width}, not a multiple of its heads of {shape.head_width} channels"
+    if shape.embedding % 2:
+        return f"shape.embedding is {shape.embedding}, which has to be even"
     return None
 
 
@@ -165,6 +205,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     `steps` are optimiser steps; `batch` counts objects per step over all accumulations.
     """
 
+    part: Literal["views", "shape"] = "views"  # of the model that is trained; the other part stays as it is
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 8
     accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
     steps: Annotated[int, Meta(ge=1, le=10**9)] = 4000
@@ -198,6 +239,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     tilted: Share = 0.5
     mirror: bool = True
     hue: bool = True
+    disturb: bool = False  # change the pictures as photographs differ from renders (data/disturb.py)
     pbr_weight: Weight = 0.1
     pbr_snr: Weight = 1.0  # the rendering loss applies where the SNR is above this
     pbr_pixels: Annotated[int, Meta(ge=1, le=10**9)] = 768  # shaded for each object by the rendering loss
@@ -236,6 +278,38 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
     "small": (
         ModelConfig(sampling_steps=1, sampling_mirrored=True, row_attention=(True, False, False), noisy_input="shrunk"),
         TrainConfig(),
+    ),
+    # The shape first, then the views painted onto its renderings: what the bundled model is. `--part shape` trains its
+    # shape network by SHAPE_TRAINING.
+    "volume": (
+        ModelConfig(
+            image_size=128,
+            patch=4,
+            encoder_patch=16,
+            sampling_steps=1,
+            row_attention=(True, False, False),
+            noisy_input="shrunk",
+            encoder_width=96,
+            encoder_layers=2,
+            domain_layout="channels",
+            channels=(96, 128, 128),
+            cross_domain="none",
+            condition_skip=True,
+            shape=ShapeConfig(),
+        ),
+        TrainConfig(
+            batch=8,
+            phases=(Phase(),),
+            optimizer="muon",
+            betas=(0.9, 0.99),
+            pure_noise=1.0,
+            pbr_weight=0.0,
+            drop_embedding=0.0,
+            drop_latent=0.0,
+            drop_both=0.05,
+            disturb=True,
+            absolute_domains=("normal", "depth", "roughness", "metallic"),
+        ),
     ),
     # The paper's training: Stable Diffusion Image Variations grown to six domains; 30,000 multi-view steps, then 20,000
     # with attention across the domains, batch 512
@@ -282,6 +356,19 @@ PRESETS: dict[str, tuple[ModelConfig, TrainConfig]] = {
         ),
     ),
 }
+
+# Training of a preset's shape network.
+SHAPE_TRAINING = TrainConfig(
+    part="shape",
+    batch=16,
+    steps=20_000,
+    phases=(Phase(learning_rate=6e-4),),
+    optimizer="muon",
+    warmup=200,
+    betas=(0.9, 0.99),
+    weight_decay=0.02,
+    tilted=0.4,
+)
 
 # Variants that the paper's claims are compared with, as changes of the model's and the training's configuration.
 ABLATIONS: dict[str, tuple[dict, dict]] = {

@@ -8,18 +8,19 @@ from typing import Literal
 
 import msgspec
 
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, UsageError
 from gdtool.core.reading import read_json
-from gdtool.diffusion.config import ABLATIONS, PRESETS, ModelConfig, TrainConfig
+from gdtool.diffusion.config import ABLATIONS, PRESETS, SHAPE_TRAINING, ModelConfig, TrainConfig
 
 
 def configuration(
-    preset: str, ablation: str, file: str | None, values: Mapping[str, int | str], size: int | None
+    preset: str, part: str, ablation: str, file: str | None, values: Mapping[str, int | str], size: int | None
 ) -> tuple[ModelConfig, TrainConfig]:
     """Build the configurations of a preset, changed by an ablation, then by a file, then by values.
 
     Args:
         preset: a name in PRESETS.
+        part: "views" or "shape", the part of the model that is trained.
         ablation: a name in ABLATIONS.
         file: path of JSON {"model": {...}, "train": {...}} with fields of ModelConfig and TrainConfig, or None.
         values: fields of TrainConfig.
@@ -28,9 +29,14 @@ def configuration(
     Returns:
         The model's and the training's configuration. Raises InputError for a file or a size that does not fit.
     """
-    parts = [msgspec.to_builtins(part) for part in PRESETS[preset]]
-    for part, changes in zip(parts, ABLATIONS[ablation], strict=True):
-        part.update(changes)
+    model, train = PRESETS[preset]
+    if part == "shape":
+        if model.shape is None:
+            raise UsageError("--part shape", f"preset {preset} has no shape network", "use --preset volume")
+        train = SHAPE_TRAINING
+    parts = [msgspec.to_builtins(fields) for fields in (model, train)]
+    for fields, changes in zip(parts, ABLATIONS[ablation], strict=True):
+        fields.update(changes)
     if file is not None:
         path = Path(file)
         try:
@@ -39,8 +45,8 @@ def configuration(
             raise InputError(
                 path, str(error), 'write {"model": {...}, "train": {...}} with names and values of docs/training.md'
             ) from None
-        for part, name in zip(parts, ("model", "train"), strict=True):
-            part.update(changes.get(name, {}))
+        for fields, name in zip(parts, ("model", "train"), strict=True):
+            fields.update(changes.get(name, {}))
     parts[1].update(values)
     try:
         model, train = msgspec.convert(parts[0], ModelConfig), msgspec.convert(parts[1], TrainConfig)

@@ -32,7 +32,17 @@ HELD_OUT = 4  # objects; all but one where there are fewer
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Hold the options of `gdtool train`."""
 
-    preset: Annotated[Literal["small", "tiny", "paper"], Meta(description="Configuration to start from.")] = "small"
+    preset: Annotated[
+        Literal["volume", "small", "tiny", "paper"],
+        Meta(
+            description="Configuration to start from. volume: the shape first, then the views on it. small, paper: "
+            "views alone, as the paper has them, at two sizes. tiny: for tests."
+        ),
+    ] = "small"
+    part: Annotated[
+        Literal["views", "shape"],
+        Meta(description="Part of the model to train. The other part stays as it is in --start."),
+    ] = "views"
     ablation: Annotated[
         Literal["none", "no_cross_domain", "one_way", "two_way", "no_pbr", "color_normal"],
         Meta(description="Part of the method to leave out or change; color_normal: Wonder3D's two domains."),
@@ -134,7 +144,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         objects = decode_dataset(folders, count, model_config, out.workspace, warn=out.warn)
     used = len(objects) - min(options.held_out, len(objects) - 1)
     held_out_objects, objects = objects.part(slice(used, None)), objects.part(slice(used))
-    recorder = Recorder(out.workspace, held_out_objects, train_config.precision, options.tensorboard)
+    recorder = Recorder(out.workspace, held_out_objects, train_config, options.tensorboard)
     distributed.start()
     run_options = RunOptions(
         options.seed, options.minutes, options.checkpoint_every, options.validate_every, out.device
@@ -182,7 +192,7 @@ def configured(options: Options):
     precision = None if options.precision == "auto" else options.precision
     flags = {"steps": steps, "batch": options.batch, "precision": precision}
     values = {name: value for name, value in flags.items() if value is not None}
-    return configuration(options.preset, options.ablation, options.config, values, options.size)
+    return configuration(options.preset, options.part, options.ablation, options.config, values, options.size)
 
 
 STAGE = Stage(

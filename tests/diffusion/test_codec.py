@@ -12,7 +12,8 @@ from gdtool.diffusion.data.objects import draw_batch
 from gdtool.diffusion.network import codec as codecs
 from gdtool.diffusion.network.codec import CHUNK, PatchCodec, VaeCodec
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.training.loop import choose_step, losses, phase_at
+from gdtool.diffusion.training.loop import phase_at
+from gdtool.diffusion.training.objective import choose_step, view_losses
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
 
@@ -94,12 +95,12 @@ def test_only_the_domains_and_objects_of_the_rendering_loss_are_decoded(monkeypa
     model.sigma = torch.ones_like(model.sigma)
     choices, generators = zip(*(step.choices(place) for place in range(2)), strict=True)
     model.alpha[_timesteps(step)[:near]] = 3.0
-    losses(model, draw_batch(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
+    view_losses(model, draw_batch(objects, np.arange(2), MODEL, train, choices), step, list(generators), train)
     assert sum(counts) == near * 4 * len(step.views)
 
 
 def _timesteps(step):
-    """Return the timesteps that losses() chooses for two objects."""
+    """Return the timesteps that view_losses() chooses for two objects."""
     choices = [step.choices(place) for place in range(2)]
     draw_batch(spheres(2), np.arange(2), MODEL, TRAIN, [numpy_generator for numpy_generator, _ in choices])
     return [int(torch.rand(4, generator=generator)[0] * MODEL.timesteps) for _, generator in choices]

@@ -17,7 +17,7 @@ import msgspec, torch
 from gdtool.diffusion.training import distributed
 from gdtool.diffusion.config import Phase
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.reports.report import append_validation, validation
+from gdtool.diffusion.reports.report import append_validation, view_validation
 from gdtool.diffusion.training.loop import Observers, RunOptions, run_training
 from tests.diffusion.test_training import MODEL, TRAIN, spheres
 
@@ -41,7 +41,7 @@ def progress(iterable, total, label):
 
 def validate(state):
     assert distributed.rank() == 0
-    append_validation(workspace / "validation.csv", state.step, 0.0, validation(state, spheres(1), "float32")[1])
+    append_validation(workspace / "validation.csv", state.step, 0.0, view_validation(state, spheres(1), "float32")[1])
 
 try:
     options = RunOptions(seed=0, checkpoint_every=2, validate_every=3)

@@ -24,17 +24,17 @@ from gdtool.diffusion.network.encoding import PLANES, planes_from_images
 from gdtool.diffusion.network.labels import class_labels
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.training import loop as training
-from gdtool.diffusion.training import optimizer
+from gdtool.diffusion.training import objective, optimizer
 from gdtool.diffusion.training.loop import (
     CHECKPOINT,
     Observers,
     RunOptions,
-    choose_step,
     learning_rate,
     new_state,
     phase_at,
     run_training,
 )
+from gdtool.diffusion.training.objective import choose_step
 from tests.diffusion.spheres import LIGHT, sphere_views
 
 MODEL, TRAIN = PRESETS["tiny"]
@@ -115,7 +115,7 @@ def test_steps_have_color_and_the_phases_number_of_domains_and_views():
 def test_a_phase_may_set_its_batch_size(monkeypatch):
     batches = []
     monkeypatch.setattr(
-        training, "draw_batch", lambda objects, idx, *rest: batches.append(len(idx)) or draw_batch(objects, idx, *rest)
+        training, "draw", lambda objects, idx, *rest: batches.append(len(idx)) or draw_batch(objects, idx, *rest)
     )
     train = msgspec.structs.replace(TRAIN, phases=(Phase(share=1.0, domains=1, views=1, batch=3),))
     training.train_step(new_state(Model(MODEL), train), spheres(), train, 0, None, "cpu")
@@ -256,14 +256,14 @@ def test_training_lowers_the_error(tmp_path):
 
 
 def poisoned(monkeypatch, bad):
-    """Make the gradient of losses() not finite in the steps for which bad(number) is true."""
-    plain = training.losses
+    """Make the gradient of view_losses() not finite in the steps for which bad(number) is true."""
+    plain = objective.view_losses
 
     def losses(model, batch, step, *rest):
         out = plain(model, batch, step, *rest)
         return out | {"loss": out["loss"] * float("nan")} if bad(step.number) else out
 
-    monkeypatch.setattr(training, "losses", losses)
+    monkeypatch.setattr(objective, "view_losses", losses)
 
 
 def test_steps_with_a_gradient_that_is_not_finite_are_skipped_with_a_warning(tmp_path, monkeypatch):

@@ -31,13 +31,16 @@ class Objects:
 
     planes (n, k, 13, h, w) uint8: the channels that encoding.PLANES lists. conditions (n, c, 4, h, w) uint8: red,
     green, blue and coverage; the first is the front view. Bytes 0 to 254 stand for -1 to 1, so 127 is 0. lights (n, 16,
-    7) float32: axis, sharpness and amplitude of spherical Gaussians. names: one for each object.
+    7) float32: axis, sharpness and amplitude of spherical Gaussians. names: one for each object. volumes (n, bytes)
+    uint8: bits of the volumes that the views carve, as volumes.pack_volume() makes them; None for a model without a
+    shape network.
     """
 
     planes: np.ndarray
     conditions: np.ndarray
     lights: np.ndarray
     names: tuple[str, ...]
+    volumes: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of objects."""
@@ -45,7 +48,8 @@ class Objects:
 
     def part(self, chosen: slice) -> Objects:
         """Return the objects that a slice selects."""
-        return Objects(self.planes[chosen], self.conditions[chosen], self.lights[chosen], self.names[chosen])
+        volumes = None if self.volumes is None else self.volumes[chosen]
+        return Objects(self.planes[chosen], self.conditions[chosen], self.lights[chosen], self.names[chosen], volumes)
 
 
 def to_bytes(x: np.ndarray) -> np.ndarray:
@@ -151,6 +155,9 @@ def decode_dataset(
     Returns:
         The decoded objects. Raises InputError when no object is usable.
     """
+    from gdtool.diffusion.data.volumes import pack_volume
+    from gdtool.diffusion.shape.volume import volume_side
+
     h, k = config.image_size, len(config.views)
     names_file = cache / "objects.json"
     files = {
@@ -158,6 +165,8 @@ def decode_dataset(
         "conditions": ((conditions, 4, h, h), np.uint8),
         "lights": ((LIGHT_COUNT, 7), np.float32),
     }
+    if config.shape is not None:
+        files["volumes"] = ((-(-(volume_side(h) ** 3) // 8),), np.uint8)
     if not names_file.is_file():
         arrays = {
             name: np.lib.format.open_memmap(cache / f"{name}.npy", "w+", dtype, (count, *shape))
@@ -174,6 +183,8 @@ def decode_dataset(
             arrays["planes"][i] = to_bytes(planes)
             arrays["conditions"][i] = to_bytes(rgba)[np.arange(conditions) % len(rgba)]
             arrays["lights"][i] = light
+            if config.shape is not None:
+                arrays["volumes"][i] = pack_volume(planes, config.views)
             names.append(folder.path.parent.name if folder.path.name == "views" else folder.name)
         for array in arrays.values():
             array.flush()
@@ -192,12 +203,19 @@ class Batch:
     """Hold the inputs of a training step for b objects with k views.
 
     planes (b, k, 13, h, w), condition (b, 4, h, w), lights (b, 16, 7): float32, as Objects stores them but in [-1, 1].
-    Nothing is composited over a background yet.
+    Nothing is composited over a background yet. occupancy (b, r, r, r) uint8: the volumes; None without a shape
+    network.
     """
 
     planes: torch.Tensor
     condition: torch.Tensor
     lights: torch.Tensor
+    occupancy: torch.Tensor | None = None
+
+    def to(self, device: str) -> Batch:
+        """Move all tensors to a device."""
+        parts = (self.planes, self.condition, self.lights, self.occupancy)
+        return Batch(*(None if x is None else x.to(device) for x in parts))
 
 
 def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:
@@ -219,9 +237,13 @@ def draw_batch(
 
     generators: one for each object, so that the result does not depend on how a batch is split.
     """
+    from gdtool.diffusion.data.disturb import disturb_picture
+    from gdtool.diffusion.data.volumes import condition_from_unit, unit_picture, unpack_volume
+
     planes: list[torch.Tensor] = []
     rgba: list[torch.Tensor] = []
     lights: list[torch.Tensor] = []
+    volumes: list[torch.Tensor] = []
     for i, generator in zip(idx, generators, strict=True):
         tilted = generator.random() < train.tilted and objects.conditions.shape[1] > 1
         pick = int(generator.integers(1, objects.conditions.shape[1])) if tilted else 0
@@ -230,13 +252,23 @@ def draw_batch(
             from_bytes(objects.conditions[i, pick]),
             torch.from_numpy(np.array(objects.lights[i])),
         )
+        volume = None
+        if config.shape is not None and objects.volumes is not None:
+            volume = torch.from_numpy(unpack_volume(objects.volumes[i], config.image_size).astype(np.uint8))
         if train.mirror and generator.random() < 0.5:
             sample = mirror_object(*sample, config.views)
+            volume = None if volume is None else volume.flip(-1)
         if train.hue:
             sample = permute_colors(*sample, generator.permutation(3))
+        if train.disturb:
+            unit = disturb_picture(unit_picture(sample[1].numpy()), generator)
+            sample = (sample[0], torch.from_numpy(condition_from_unit(unit)), sample[2])
         for out, value in zip((planes, rgba, lights), sample, strict=True):
             out.append(value)
-    return Batch(torch.stack(planes), torch.stack(rgba), torch.stack(lights))
+        if volume is not None:
+            volumes.append(volume)
+    stacked = (torch.stack(planes), torch.stack(rgba), torch.stack(lights))
+    return Batch(*stacked, torch.stack(volumes) if volumes else None)
 
 
 def mirror_object(planes, rgba, light, views: tuple[str, ...]):

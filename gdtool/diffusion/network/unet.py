@@ -150,9 +150,20 @@ class Block(nn.Module):
 
 
 class UNet(nn.Module):
-    """Predict noise, velocity or x_0, as config.prediction says, for every image of a batch of objects."""
+    """Predict noise, velocity or x_0, as config.prediction says, for every image of a batch of objects.
 
-    def __init__(self, config: ModelConfig, latent_channels: int, condition_channels: int, side: int):
+    latent_channels, condition_channels: of the two inputs. side: width and height of the features. outputs: channels
+    that are predicted; None: as many as the latents have.
+    """
+
+    def __init__(
+        self,
+        config: ModelConfig,
+        latent_channels: int,
+        condition_channels: int,
+        side: int,
+        outputs: int | None = None,
+    ):
         super().__init__()
         self.config = config
         widths, width0 = config.channels, config.channels[0]
@@ -188,15 +199,17 @@ class UNet(nn.Module):
                 Block(inputs, width, sides[i], attention=config.attention_levels[i], rows=rows[i], up=i > 0, **common)
             )
         self.conv_norm_out = nn.GroupNorm(config.norm_groups, width0)
-        self.conv_out = nn.Conv2d(width0, latent_channels, 3, padding=1)
+        self.conv_out = nn.Conv2d(width0, outputs or latent_channels, 3, padding=1)
         self.latent_channels = latent_channels
+        self.condition_skip = config.condition_skip and outputs is None
         if config.condition_skip:
+            nn.init.zeros_(self.conv_out.weight)
+            nn.init.zeros_(self.conv_out.bias)
+        if self.condition_skip:
             # A gate for each (domain, view) on the condition's pixels: 1 for the front color view, which nearly is it.
             gate = torch.zeros(len(DOMAINS), len(config.views))
             gate[0, 0] = 1.0
             self.condition_gate = nn.Parameter(gate)
-            nn.init.zeros_(self.conv_out.weight)
-            nn.init.zeros_(self.conv_out.bias)
 
     def forward(self, noisy, condition, timestep, label, context, layout: Layout, view_idx=None):
         """Predict (n, c, h, w) from latents noisy (n, c, h, w) and condition (n, e, h, w).
@@ -226,7 +239,7 @@ class UNet(nn.Module):
             if block.upsamplers:
                 x = block.upsamplers[0](x)
         out = self.conv_out(F.silu(self.conv_norm_out(x)))
-        if self.config.condition_skip:
+        if self.condition_skip:
             views = torch.arange(layout.views) if view_idx is None else view_idx
             gate = self.condition_gate[list(layout.domains)][:, views].reshape(-1).repeat(layout.objects)
             out = out + gate[:, None, None, None] * condition[:, : self.latent_channels]

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 from gdtool.core.kinds import ModelContent
 from gdtool.core.stage import Output
 from gdtool.diffusion.checkpoint.weights import save_model
+from gdtool.diffusion.config import TrainConfig
 from gdtool.diffusion.data.objects import Objects, from_bytes
 from gdtool.diffusion.inference import familiarity
 from gdtool.diffusion.network.model import parameter_count
 from gdtool.diffusion.reports.curve import draw_curve
-from gdtool.diffusion.reports.report import append_validation, model_card, validation
+from gdtool.diffusion.reports.report import append_validation, model_card, shape_validation, view_validation
 from gdtool.diffusion.training import distributed
 from gdtool.diffusion.training.loop import Observers, State
 from gdtool.diffusion.training.tensorboard import Events
@@ -29,11 +30,12 @@ PICTURES_EACH = 2  # most condition images of an object that are measured
 class Recorder:
     """Write validation pictures, validation.csv and TensorBoard events of a run into its workspace.
 
-    precision: of the network when it samples, "float32" or "bfloat16". tensorboard: whether to write events.
+    train: of the run; its precision, "float32" or "bfloat16", is also that of sampling. tensorboard: whether to write
+    events.
     """
 
-    def __init__(self, workspace: Path, held_out: Objects, precision: str, tensorboard: bool):
-        self.workspace, self.held_out, self.precision = workspace, held_out, precision
+    def __init__(self, workspace: Path, held_out: Objects, train: TrainConfig, tensorboard: bool):
+        self.workspace, self.held_out, self.train = workspace, held_out, train
         (workspace / "validation").mkdir(exist_ok=True)
         self.events = Events(workspace / "tensorboard") if tensorboard else None
 
@@ -41,9 +43,12 @@ class Recorder:
         """Sample the held-out objects, if there are any."""
         if not len(self.held_out):
             return
-        grid, psnr = validation(state, self.held_out, self.precision)
+        if self.train.part == "shape":
+            grid, figures = shape_validation(state, self.held_out)
+        else:
+            grid, figures = view_validation(state, self.held_out, self.train.precision)
         write_png(self.workspace / "validation" / f"step_{state.step:06d}.png", grid)
-        append_validation(self.workspace / "validation.csv", state.step, state.seconds, psnr)
+        append_validation(self.workspace / "validation.csv", state.step, state.seconds, figures)
         if self.events is not None:
             self.events.picture(state.step, grid)
 

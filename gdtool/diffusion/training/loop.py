@@ -23,19 +23,14 @@ import numpy as np
 import torch
 
 from gdtool.core.errors import InputError
-from gdtool.core.kinds import DOMAINS
 from gdtool.core.reading import parse_json
-from gdtool.diffusion.config import ModelConfig, Phase, TrainConfig
-from gdtool.diffusion.data.objects import Batch, Objects, draw_batch, object_order
-from gdtool.diffusion.inference.sampling import precision_context
-from gdtool.diffusion.network.attention import Layout
-from gdtool.diffusion.network.encoding import BACKGROUND, encode, encode_condition
+from gdtool.diffusion.config import Phase, TrainConfig
+from gdtool.diffusion.data.objects import Objects, object_order
 from gdtool.diffusion.network.model import Model
-from gdtool.diffusion.network.schedule import loss_weight
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training import distributed
 from gdtool.diffusion.training.arithmetic import with_arithmetic
-from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, image_error, rendering_error, view_directions
+from gdtool.diffusion.training.objective import Objective, choose_step, columns, draw
 from gdtool.diffusion.training.optimizer import MOMENTS, make_optimizer, restore_moments
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -55,39 +50,13 @@ class State:
     skipped: int = 0  # steps in a row whose gradient was not finite
 
 
-@dataclass(frozen=True)
-class Step:
-    """Hold the random choices of one step.
-
-    domains: indices into DOMAINS, and views (k,): indices into the configuration's views; both are common to all
-    objects of the batch. seed, number: of the run and of the step, which seed the choices of each object.
-    """
-
-    domains: tuple[int, ...]
-    views: torch.Tensor
-    seed: int
-    number: int
-
-    def choices(self, place: int) -> tuple[np.random.Generator, torch.Generator]:
-        """Return the generators for the object at this place of the step's batch: NumPy's, and PyTorch's on the CPU."""
-        choices = np.random.default_rng((self.seed, 3, self.number, place))
-        return choices, torch.Generator().manual_seed(int(choices.integers(2**62)))
-
-
-class Objective(torch.nn.Module):
-    """Wrap losses() as a module, so that the hooks of DDP and FSDP see the forward pass."""
-
-    def __init__(self, model: Model, train: TrainConfig):
-        super().__init__()
-        self.model, self.train_config = model, train
-
-    def forward(self, batch: Batch, step: Step, generators: list[torch.Generator]) -> dict[str, torch.Tensor]:
-        """Compute the losses of a micro-batch by name."""
-        return losses(self.model, batch, step, generators, self.train_config)
-
-
 def new_state(model: Model, train: TrainConfig) -> State:
-    """Create the state before the first step, with the objective wrapped for all processes."""
+    """Create the state before the first step, with the objective wrapped for all processes.
+
+    The parameters of the part that is not trained are frozen.
+    """
+    for name, p in model.named_parameters():
+        p.requires_grad_(name.startswith("shape.") == (train.part == "shape"))
     objective = distributed.wrap(Objective(model, train))
     optimizer = make_optimizer(model, train)
     average = {name: distributed.local_part(p).clone() for name, p in model.named_parameters()}
@@ -111,92 +80,6 @@ def learning_rate(state: State, progress: float, train: TrainConfig) -> float:
     """Compute the learning rate: the phase's rate times the warm-up, and times a cosine decay where configured."""
     rate = phase_at(progress, train).learning_rate * min((state.step + 1) / train.warmup, 1.0)
     return rate * (0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * progress))) if train.decay else rate
-
-
-def choose_step(config: ModelConfig, phase: Phase, seed: int, step: int) -> Step:
-    """Choose a step's domains and views at random.
-
-    In a model with attention across domains, color is among the domains wherever there is more than one.
-    """
-    choices = np.random.default_rng((seed, 2, step))
-    modelled = [DOMAINS.index(d) for d in config.domains]
-    if phase.domains >= len(modelled):
-        domains = tuple(modelled)
-    elif phase.domains == 1 or config.cross_domain == "none":
-        domains = tuple(sorted(choices.permutation(modelled)[: phase.domains].tolist()))
-    else:
-        domains = (0, *sorted(choices.permutation(modelled[1:])[: phase.domains - 1].tolist()))
-    views = torch.from_numpy(np.sort(choices.permutation(len(config.views))[: phase.views]))
-    return Step(domains, views, seed, step)
-
-
-def losses(
-    model: Model, batch: Batch, step: Step, generators: list[torch.Generator], train: TrainConfig
-) -> dict[str, torch.Tensor]:
-    """Compute the objective of a micro-batch of b objects, "loss", and its parts by name, each a mean over the objects.
-
-    generators: b, one for each object. They decide its timestep, noise, background, dropped conditions and shaded
-    pixels.
-    """
-    config, b, device = model.config, len(batch.planes), batch.planes.device
-    layout = Layout(b, step.domains, len(step.views))
-    n = layout.images // b
-
-    # four numbers for each object: timestep, whether it is the last one, what is dropped, background
-    dice = torch.stack([torch.rand(4, generator=generator) for generator in generators])
-    background = torch.tensor(
-        [BACKGROUND[config.backgrounds[int(x * len(config.backgrounds))]] for x in dice[:, 3]], device=device
-    )
-    planes = batch.planes[:, step.views]
-    truth = encode(planes, step.domains, background)  # (b, d, k, 3, h, w)
-    clean = model.codec.encode(truth.flatten(0, 2))
-    rgba = encode_condition(batch.condition, background)
-
-    # One timestep for all images of an object, as when sampling.
-    t = (dice[:, 0] * config.timesteps).long()
-    t = torch.where(dice[:, 1] < train.pure_noise, config.timesteps - 1, t).to(device)
-    noise = torch.cat([torch.randn(n, *clean.shape[1:], generator=generator) for generator in generators]).to(device)
-    a, s = model.levels(t, layout)
-    noisy = a * clean + s * noise
-
-    drop = dice[:, 2].to(device)
-    embedding_off = drop < train.drop_embedding + train.drop_both
-    latent_off = (drop >= train.drop_embedding) & (drop < train.drop_embedding + train.drop_both + train.drop_latent)
-    with precision_context(device, train.precision):
-        context = model.encoder(rgba) * ~embedding_off[:, None, None]
-        condition = (
-            model.condition_latents(rgba, layout, step.views) * ~latent_off.repeat_interleave(n)[:, None, None, None]
-        )
-        predicted = model.predict_clean(noisy, condition, t, context, layout, step.views)
-
-    weighted, square = image_error(predicted, clean, b, step.domains, config, train)  # (b, d) each
-    weight = loss_weight(model.alpha[t], model.sigma[t], train.snr_gamma, train.snr_floor)
-    total = (weight[:, None] * weighted).mean()
-    parts = {DOMAINS[i]: square[:, j].mean().detach() for j, i in enumerate(step.domains)}
-
-    snr = (model.alpha[t] / model.sigma[t]).square()
-    near = torch.nonzero(snr > train.pbr_snr).flatten()
-    if train.pbr_weight > 0 and len(near) and {1, 3, 4, 5} <= set(step.domains):
-        # Only the domains that shading reads are decoded, and only of these objects.
-        lit = [j for j, i in enumerate(step.domains) if DOMAINS[i] in SHADED_DOMAINS]
-        latents = predicted.unflatten(0, (b, len(step.domains), -1))[:, lit]
-        directions = view_directions(config)[step.views].to(device)
-        order = {step.domains[j]: place for place, j in enumerate(lit)}
-        rendered = []
-        for i in near.tolist():
-            images = model.codec.decode(latents[i].flatten(0, 1)).unflatten(0, latents.shape[1:3])
-            error = rendering_error(
-                images,
-                truth[i][lit],
-                order,
-                LitObject(planes=planes[i], lights=batch.lights[i], views=directions, background=float(background[i])),
-                pixels=train.pbr_pixels,
-                generator=generators[i],
-            )
-            rendered.append(snr[i].clamp(max=train.snr_gamma) * error)
-        parts["rendering"] = (torch.stack(rendered).sum() / b).detach()
-        total = total + train.pbr_weight * torch.stack(rendered).sum() / b
-    return {"loss": total, **parts}
 
 
 def train_step(
@@ -227,8 +110,7 @@ def train_step(
     parts_of = [distributed.part_for_process(part) for part in np.array_split(places, count)]
     for number, part in enumerate(parts_of):
         choices, generators = zip(*(step.choices(int(place)) for place in part), strict=True)
-        batch = draw_batch(objects, idx[part], config, train, choices)
-        batch = Batch(batch.planes.to(device), batch.condition.to(device), batch.lights.to(device))
+        batch = draw(objects, idx[part], config, train, choices).to(device)
         with distributed.synchronised(state.objective, number == len(parts_of) - 1):
             parts = state.objective(batch, step, list(generators))
             share = len(part) / len(idx)
@@ -244,9 +126,8 @@ def train_step(
     state.optimizer.zero_grad(set_to_none=True)
     state.step += 1
     keep = min(train.ema, (1 + state.step) / (10 + state.step))
-    names = list(state.average)
-    weights = {name: distributed.local_part(p) for name, p in state.model.named_parameters()}
-    torch._foreach_lerp_([state.average[n] for n in names], [weights[n] for n in names], 1 - keep)
+    weights = {name: distributed.local_part(p) for name, p in state.model.named_parameters() if p.requires_grad}
+    torch._foreach_lerp_([state.average[name] for name in weights], list(weights.values()), 1 - keep)
     return {"step": state.step, "rate": rate, "norm": float(norm), "skipped": int(not finite), **sums}
 
 
@@ -371,7 +252,7 @@ def run_training(
     log_path = workspace / "loss.csv"
     target = log_path if distributed.rank() == 0 else Path(os.devnull)
     with target.open("r+" if resumed and log_path.is_file() else "w", newline="") as file:
-        writer = _resume_log(file, state.step if resumed else 0, model.config.domains)
+        writer = _resume_log(file, state.step if resumed else 0, columns(model.config, train))
         bar = iter(observers.progress(range(state.step, train.steps), train.steps, "training"))
         while progress_of(state, train, options.minutes) < 1:
             start = time.perf_counter()
@@ -411,16 +292,16 @@ def _warn_skipped(state: State, warn: Callable[[str], None]) -> None:
         warn(f"step {state.step} is left out: its gradient is not finite ({state.skipped} in a row)")
 
 
-def _resume_log(file, step: int, domains: tuple[str, ...]) -> csv.DictWriter:
+def _resume_log(file, step: int, parts: tuple[str, ...]) -> csv.DictWriter:
     """Create a writer of loss.csv that keeps the rows up to `step`.
 
-    A resumed run starts at its checkpoint and writes the later rows again.
+    parts: names of the loss's parts. A resumed run starts at its checkpoint and writes the later rows again.
     """
-    columns = ["step", "seconds", "loss", "rate", "norm", "skipped", *domains, "rendering"]
+    names = ["step", "seconds", "loss", "rate", "norm", "skipped", *parts]
     earlier_rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step] if step else []
     file.seek(0)
     file.truncate() if file.name != os.devnull else None
-    writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore")
+    writer = csv.DictWriter(file, names, restval="", extrasaction="ignore")
     writer.writeheader()
     writer.writerows(earlier_rows)
     return writer

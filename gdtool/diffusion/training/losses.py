@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 
 from gdtool.cameras.camera import rig
 from gdtool.core.kinds import DOMAINS
@@ -29,14 +30,16 @@ def image_error(
     domains: tuple[int, ...],
     config: ModelConfig,
     train: TrainConfig,
+    trust: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute the weighted and the squared error of latents (b d k, c, h, w), as means (b, d) by object and domain.
 
     train.domain_weights multiply the values of each domain; the coverage in a scalar domain's third channel has weight
     1. In the domains of train.absolute_domains the error of a value is its distance from the truth, smoothed below
     SMOOTHED_BELOW (Charbonnier's loss); the distance of a normal is taken over its three axes. In the others the error
-    is the square of the distance. A VAE's latents have no channel of coverage and are weighted as a whole. The second
-    result is the plain squared error, without weights.
+    is the square of the distance. A VAE's latents have no channel of coverage and are weighted as a whole. trust (b, d,
+    k, h, w): weights of the pixels, patch codec only; None: 1. The second result is the squared error with the weights
+    of the pixels alone.
     """
     square = (predicted - clean).float().square()
     if config.codec != "patch":
@@ -44,9 +47,13 @@ def image_error(
         return square * square.new_tensor([train.domain_weights[i] for i in domains]), square
     square = square.unflatten(1, (3, -1)).unflatten(0, (objects, len(domains), -1))  # (b, d, k, 3, patch², h, w)
     weighted = []
+    if trust is not None:
+        pixels = F.pixel_unshuffle(trust[:, :, :, None], config.patch)[:, :, :, None]  # (b, d, k, 1, patch², h, w)
+        square = square * pixels
     for j, i in enumerate(domains):
         value, coverage = square[:, j].split((2, 1) if DOMAINS[i] in SCALARS else (3, 0), dim=2)
         if DOMAINS[i] in train.absolute_domains:
+            # of values with a trust of 0 or 1, or nearly so, the distance is trusted as its square is
             value = ((value.mean(2, keepdim=True) + SMOOTHED_BELOW**2).sqrt() - SMOOTHED_BELOW).expand_as(value)
         weighted.append(torch.cat([train.domain_weights[i] * value, coverage], 2).flatten(1).mean(1))
     return torch.stack(weighted, 1), square.flatten(2).mean(2)

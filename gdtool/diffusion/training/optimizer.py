@@ -17,6 +17,11 @@ FIRST_AND_LAST_LAYERS = (
     "position",
     "condition_gate",
     "embed",
+    "read_picture",
+    "read_space",
+    "embed_code",
+    "write",
+    "project",
 )
 MOMENTS = ("step", "exp_avg", "exp_avg_sq", "momentum_buffer")
 MIN_MUON_SIDE = 32  # least rows and columns of a matrix that Muon trains
@@ -99,7 +104,9 @@ class MuonAndAdam:
 
 
 def make_optimizer(model: torch.nn.Module, train: TrainConfig):
-    """Create the configured optimiser. Weight decay applies to matrices and not to vectors.
+    """Create the configured optimiser of the parameters that have gradients.
+
+    Weight decay applies to matrices and not to vectors.
 
     The class embedding has train.class_rate times the learning rate. Raises UsageError for Muon with weights that FSDP2
     has split.
@@ -107,6 +114,8 @@ def make_optimizer(model: torch.nn.Module, train: TrainConfig):
     groups: dict[tuple[bool, float], list] = {}
     matrices = []
     for name, p in model.named_parameters():
+        if not p.requires_grad:
+            continue
         inner = (
             p.ndim >= 2
             and min(p.shape[0], p[0].numel()) >= MIN_MUON_SIDE
