@@ -112,7 +112,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.checkpoint import wonder3d
     from gdtool.diffusion.checkpoint.weights import load_model
     from gdtool.diffusion.data.condition import PictureOptions, make_condition, trained_extent
-    from gdtool.diffusion.inference.pipeline import choose_domains, sample_condition, warn_of_doubts
+    from gdtool.diffusion.inference.pipeline import Subject, choose_domains, sample_subject, warn_of_doubts
     from gdtool.diffusion.inference.result import views_from_images
     from gdtool.diffusion.inference.sampling import SamplingOptions
     from gdtool.diffusion.network.encoding import BACKGROUND
@@ -140,7 +140,9 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
             scheduler=options.scheduler,
             precision=options.precision,
         )
-        images = sample_condition(model, folder, condition, settings, options.compile, inputs.name, out)
+        images, silhouettes = sample_subject(
+            model, folder, Subject(inputs.name, condition), settings, options.compile, out
+        )
     if config.convention == "wonder3d" and "normal" in images:
         images["normal"] = wonder3d.premultiplied_normals(images["normal"])
     rig_name = "wonder3d" if config.convention == "wonder3d" else "six"
@@ -151,6 +153,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         BACKGROUND[config.backgrounds[0]],
         domains,
         condition[..., 3],
+        silhouettes,
     )
     warn_of_doubts(folder, report, config, settings, inputs.name, out)
     with out.step("write"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
@@ -40,16 +40,14 @@ def compiler_cache() -> Iterator[None]:
         yield
 
 
-def sample_compiled(
-    model: Model, rgba: torch.Tensor, options: SamplingOptions, *, progress: Callable
-) -> dict[str, torch.Tensor]:
+def sample_compiled(model: Model, rgba: torch.Tensor, options: SamplingOptions, **arguments) -> dict[str, torch.Tensor]:
     """Run sample_images() with the compiled network. Raises ResourceError where it cannot be compiled."""
     from torch._dynamo.exc import TorchDynamoException
 
     model.unet.compile()
     try:
         with compiler_cache():
-            return sample_images(model, rgba, options, progress=progress)
+            return sample_images(model, rgba, options, **arguments)
     except TorchDynamoException as failure:
         raise ResourceError(
             "--compile",

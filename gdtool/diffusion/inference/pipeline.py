@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +15,9 @@ from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.data.objects import condition_batch
 from gdtool.diffusion.inference.compiled import sample_compiled
 from gdtool.diffusion.inference.familiarity import describe_doubts, describe_unfamiliar, read_ranges
-from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, averages_mirror_image, sample_images
+from gdtool.diffusion.inference.shape import make_guides
+from gdtool.diffusion.network.known import KnownImages
 from gdtool.diffusion.network.model import Model
 
 
@@ -30,21 +34,37 @@ def choose_domains(asked: tuple[str, ...] | None, config: ModelConfig) -> tuple[
     return domains
 
 
-def sample_condition(
-    model: Model,
-    ranges_folder: Path,
-    condition: np.ndarray,
-    options: SamplingOptions,
-    compiled: bool,
-    name: str,
-    out: Output,
-) -> dict[str, torch.Tensor]:
-    """Sample all views from a framed picture (size, size, 4); returns encoded images (1, k, 3, h, w) by domain.
+@dataclass(frozen=True)
+class Subject:
+    """Hold what is known of an object: its framed picture (size, size, 4), and images that are given; None: none.
+
+    name: the picture's, in warnings.
+    """
+
+    name: str
+    condition: np.ndarray
+    known: KnownImages | None = None
+
+
+class Sampled(NamedTuple):
+    """Hold sampled views: images (1, k, 3, h, w) by domain, and the silhouettes (k, h, w) of the shape that they were
+    painted on; None for a model without a shape network.
+    """
+
+    images: dict[str, torch.Tensor]
+    silhouettes: torch.Tensor | None
+
+
+def sample_subject(
+    model: Model, ranges_folder: Path, subject: Subject, options: SamplingOptions, compiled: bool, out: Output
+) -> Sampled:
+    """Sample all views of an object.
 
     ranges_folder: model folder with the ranges of the training pictures; a picture outside them causes a warning.
-    compiled: whether to compile the network first. name: the picture's name in warnings.
+    compiled: whether to compile the network first. Of a model with a shape network, seed 0 takes the best guess of the
+    shape, and other seeds choose among the possible ones.
     """
-    rgba = condition_batch(condition)
+    rgba, name = condition_batch(subject.condition), subject.name
     strange = describe_unfamiliar(rgba[0].numpy(), read_ranges(ranges_folder))
     if strange:
         figures = "; ".join(strange)
@@ -52,10 +72,14 @@ def sample_condition(
     # The memory layout that convolutions work in: 5 % faster, the same up to rounding.
     model.unet.to(memory_format=torch.channels_last)
     sample = sample_compiled if compiled else sample_images
-    images = sample(model, rgba.to(out.device), options, progress=out.progress)
+    rgba, guides = rgba.to(out.device), None
+    if model.shape is not None:
+        mirror = averages_mirror_image(model.config, options)
+        guides = make_guides(model, rgba, subject.known, seed=options.seed or None, mirror=mirror)
+    images = sample(model, rgba, options, guides=guides, known=subject.known, progress=out.progress)
     if options.guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
         out.skip("guidance of some steps", "they are outside --guided-from and --guided-to")
-    return images
+    return Sampled(images, None if guides is None else guides.mask[0].cpu())
 
 
 def warn_of_doubts(

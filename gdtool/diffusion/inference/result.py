@@ -99,6 +99,7 @@ def views_from_images(
     background: float,
     domains: tuple[str, ...],
     picture_alpha: np.ndarray | None = None,
+    silhouettes: torch.Tensor | None = None,
 ) -> tuple[Views, dict[str, float]]:
     """Convert encoded images (k, 3, h, w) of one object to the Views of some domains, and report what was corrected.
 
@@ -110,6 +111,7 @@ def views_from_images(
         picture_alpha: (h, w), coverage of the framed picture. It replaces the sampled silhouette of the front view and,
             mirrored, that of the back view. The front view's color is divided by it, since that color is nearly the
             picture.
+        silhouettes: (k, h, w), coverage by the shape that the images were painted on; None takes it from the images.
 
     Returns:
         The views with one mask each, and a report. drawn_share: share of the picture that the other views had no space
@@ -118,8 +120,8 @@ def views_from_images(
     """
     from gdtool.images.color import linear_from_srgb
 
-    soft = coverage(images, background)
-    mask = sharpen(average_opposite_views(soft, cameras)).numpy()
+    soft = coverage(images, background) if silhouettes is None else silhouettes
+    mask = sharpen(average_opposite_views(soft, cameras) if silhouettes is None else soft).numpy()
     values = decode(images, soft, background)
     if picture_alpha is not None:
         known = np.ascontiguousarray(picture_alpha, np.float32)

@@ -11,10 +11,13 @@ import torch
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig
+from gdtool.diffusion.inference.shape import make_guides
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import BACKGROUND, MIRRORED_VIEW, encode_condition, mirror_images
+from gdtool.diffusion.network.known import KnownImages, keep_known, mirror_known
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.schedule import sample
+from gdtool.diffusion.shape.guides import Guides, mirror_guides
 
 
 def precision_context(device: torch.device | str, precision: str):
@@ -51,22 +54,36 @@ def sample_images(
     rgba: torch.Tensor,
     options: SamplingOptions = SamplingOptions(),
     *,
+    guides: Guides | None = None,
+    known: KnownImages | None = None,
     progress: Callable = lambda iterable, total, label: iterable,
 ) -> dict[str, torch.Tensor]:
     """Sample every view of the domains for a batch of objects.
 
     rgba (b, 4, h, w): framed condition in [-1, 1], as objects.condition_plane() encodes it. Returns encoded images (b,
     k, 3, h, w) by domain, over the first of the configuration's backgrounds. The noise depends on the seed alone, so an
-    object's views do not depend on the rest of the batch.
+    object's views do not depend on the rest of the batch. guides: of a model with a shape network, as
+    shape.make_guides() makes them, which it does here where they are None. known: images that are given, for a model
+    with the domains as channels; they are returned as they are.
     """
     config, device = model.config, rgba.device
-    mirror = _averages_mirror_image(config, options)
-    rgba = torch.cat([rgba, rgba.flip(-1)]) if mirror else rgba
-    b = len(rgba)
+    if config.shape and guides is None:
+        guides = make_guides(model, rgba, known, mirror=averages_mirror_image(config, options))
+    mirror = averages_mirror_image(config, options)
     wanted = [d for d in config.domains if d in options.domains]
     if config.cross_domain != "none" and "color" not in wanted:
         wanted = ["color", *wanted]
+    if config.domain_layout == "channels":
+        wanted = list(config.domains)
     indices = tuple(DOMAINS.index(d) for d in wanted)
+    condition_guides, condition_known = guides, known
+    if mirror:
+        rgba = torch.cat([rgba, rgba.flip(-1)])
+        if guides is not None:
+            condition_guides = join(guides, mirror_guides(guides, config.views))
+        if known is not None:
+            condition_known = join(known, mirror_known(known, indices, config.views))
+    b = len(rgba)
     views = torch.arange(len(config.views))
     every = Layout(1, tuple(range(len(DOMAINS))), len(views))
     noise = torch.randn(model.latent_shape(every), generator=torch.Generator().manual_seed(options.seed))
@@ -90,10 +107,10 @@ def sample_images(
     with precision_context(device, options.precision):
         context = model.encoder(rgba)
     single = Layout(b, indices, len(views))
-    condition = model.condition_latents(rgba, single, views)
+    condition = model.condition_latents(rgba, single, views, condition_guides, condition_known)
     if guided:  # second half of the batch: no embedding, no latent
         double = (
-            torch.cat([condition, torch.zeros_like(condition)]),
+            condition.with_dropped(),
             torch.cat([context, torch.zeros_like(context)]),
             Layout(2 * b, indices, len(views)),
         )
@@ -123,10 +140,17 @@ def sample_images(
     if mirror:
         latents, b = latents.chunk(2)[0], b // 2
     images = model.codec.decode(latents).unflatten(0, (b, len(indices), len(views)))
+    if known is not None:
+        images = keep_known(images, known)
     return {d: images[:, j] for j, d in enumerate(wanted)}
 
 
-def _averages_mirror_image(config: ModelConfig, options: SamplingOptions) -> bool:
+def join(first: tuple, second: tuple):
+    """Concatenate two named tuples of tensors (b, …) along the first dimension."""
+    return type(first)(*(torch.cat(pair) for pair in zip(first, second, strict=True)))
+
+
+def averages_mirror_image(config: ModelConfig, options: SamplingOptions) -> bool:
     """Decide whether to average with the mirrored picture. Raises InputError where it is required and impossible."""
     possible = (
         config.codec == "patch"

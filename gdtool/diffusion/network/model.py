@@ -35,6 +35,13 @@ class Condition(NamedTuple):
         """Multiply the inputs by a factor that broadcasts against them; 0 drops the condition."""
         return Condition(self.inputs * factor, self.base)
 
+    def with_dropped(self) -> Condition:
+        """Append a condition without inputs for each, as classifier-free guidance compares with."""
+        return Condition(
+            torch.cat([self.inputs, torch.zeros_like(self.inputs)]),
+            None if self.base is None else torch.cat([self.base, self.base]),
+        )
+
 
 class Model(nn.Module):
     """Hold the UNet, the image encoder, the codec, the noise levels, the class labels, and the shape network if any.

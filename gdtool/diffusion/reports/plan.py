@@ -22,7 +22,7 @@ from gdtool.diffusion.network import attention
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
-from gdtool.diffusion.network.model import Model, parameter_count, structure
+from gdtool.diffusion.network.model import Condition, Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import alpha_and_sigma
 from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, rendering_error, view_directions
 
@@ -133,7 +133,7 @@ def _one_step(
     shape = model.latent_shape(layout)
     with torch.device(device):
         noisy, clean = torch.zeros(shape, dtype=dtype), torch.zeros(shape)
-        condition = torch.zeros(shape[0], model.codec.condition_channels, *shape[2:], dtype=dtype)
+        condition = _empty_condition(model, layout, dtype)
         rgba = torch.zeros(objects, 4, config.image_size, config.image_size, dtype=dtype)
         context = torch.zeros(objects, 1, config.encoder_width, dtype=dtype)
         model.labels, t = model.labels.to(dtype), torch.zeros(objects, dtype=torch.long)
@@ -147,6 +147,16 @@ def _one_step(
         (predicted - clean).square().mean().backward()
     hook.remove()
     return model
+
+
+def _empty_condition(model: Model, layout: Layout, dtype) -> Condition:
+    """Make a condition of zeros for a layout, with all inputs that the model reads."""
+    side, config = model.codec.side, model.config
+    if config.domain_layout == "images":
+        return Condition(torch.zeros(layout.images, model.codec.condition_channels, side, side, dtype=dtype))
+    latents = len(layout.domains) * model.codec.latent_channels
+    inputs = model.conv_mix.in_channels - latents
+    return Condition(torch.zeros(layout.objects * layout.views, inputs, side, side, dtype=dtype))
 
 
 def frozen_cost(config: ModelConfig) -> dict[str, float] | None:

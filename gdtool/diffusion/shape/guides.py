@@ -9,7 +9,7 @@ import torch.nn.functional as F
 
 from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
 from gdtool.core.kinds import DOMAINS
-from gdtool.diffusion.network.encoding import SLAB
+from gdtool.diffusion.network.encoding import SLAB, mirrored_order
 from gdtool.diffusion.shape.volume import world_axes
 
 GUIDE_CHANNELS = 9  # coverage, depth, normal (3), projected color (3), visibility
@@ -66,6 +66,13 @@ def project_picture(
         seen.append((in_front < SEEN_TOLERANCE) & facing & (covered[:, 0] > 0.5))
     visible = torch.stack(seen, 1).to(rgba.dtype) * mask
     return Guides(mask, depth, normal, torch.stack(colors, 1), visible)
+
+
+def mirror_guides(guides: Guides, views: tuple[str, ...]) -> Guides:
+    """Mirror the guides of objects about x = 0; views: names along k."""
+    order = mirrored_order(views)
+    mask, depth, normal, color, visible = (x[:, order].flip(-1) for x in guides)
+    return Guides(mask, depth, normal * normal.new_tensor([-1.0, 1.0, 1.0])[:, None, None], color, visible)
 
 
 def guide_channels(guides: Guides) -> torch.Tensor:

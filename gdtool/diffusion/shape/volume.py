@@ -106,7 +106,7 @@ def ray_positions(name: str, image_size: int) -> np.ndarray:
 
 
 @cache
-def _turning_grid(name: str, image_size: int, device: str) -> torch.Tensor:
+def _turning_grid(name: str, image_size: int, device: str, dtype: torch.dtype) -> torch.Tensor:
     """Make the sampling grid (s, u, 2) that turns a slice (z, x) into a view; u: columns of the whole image."""
     right, backward = world_axes(name)
     half = CROP_SHARE * HALF_WIDTH
@@ -114,7 +114,7 @@ def _turning_grid(name: str, image_size: int, device: str) -> torch.Tensor:
     along = ray_positions(name, image_size)
     x = across * right[0] + along[:, None] * backward[0]
     z = across * right[2] + along[:, None] * backward[2]
-    return torch.tensor(np.stack([x, z], -1) / half, dtype=torch.float32, device=device)
+    return torch.tensor(np.stack([x, z], -1) / half, dtype=dtype, device=device)
 
 
 def turn(volume: torch.Tensor, name: str, image_size: int) -> torch.Tensor:
@@ -130,7 +130,7 @@ def turn(volume: torch.Tensor, name: str, image_size: int) -> torch.Tensor:
         slices = slices.flip([axis for axis, flipped in ((2, farthest_first), (3, columns_reversed)) if flipped])
         margin = (image_size - volume.shape[-1]) // 2
         return F.pad(slices, (margin, margin))
-    grid = _turning_grid(name, image_size, str(volume.device))
+    grid = _turning_grid(name, image_size, str(volume.device), volume.dtype)
     return F.grid_sample(
         slices, grid.expand(len(volume), *grid.shape), mode="bilinear", padding_mode="zeros", align_corners=False
     )

@@ -64,7 +64,7 @@ def draw_given(model: Model, batch: Batch, generators: list[torch.Generator]) ->
             pieces.append((rgba, mask[i], geometry["depth"][i], geometry["normal"][i]))
     rgba, guide_mask, depth, normal = (torch.stack(column) for column in zip(*pieces, strict=True))
     guides = project_picture(rgba, guide_mask, depth, normal, config.views)
-    return Given(guides, KnownImages(images, given), 1 - (guide_mask - mask).abs())
+    return Given(guides, KnownImages(images, given, mask), 1 - (guide_mask - mask).abs())
 
 
 def draw_known(config: ModelConfig, dice: list[float], generator: torch.Generator) -> torch.Tensor:
