@@ -1,9 +1,9 @@
-"""Predict the cost of a training: memory and FLOPs of a step, and the time on one and on eight GPUs.
+"""Predict the cost of a training: memory and FLOPs of a step, and the time on GPUs and on this machine's processor.
 
-Nothing but the GPUs' data is taken from a table. The network is built on PyTorch's meta device, which holds shapes and
-no values, and a step is run there forward and backward. torch.utils.flop_counter counts FLOPs; memory is the sum of
-live storages. The VAE and CLIP are measured in the same way. The rendering loss is run on real numbers, since it is
-small.
+Nothing but the GPUs' data is taken from a table, and the processor's speed is probed. The network is built on PyTorch's
+meta device, which holds shapes and no values, and a step is run there forward and backward. torch.utils.flop_counter
+counts FLOPs; memory is the sum of live storages. The VAE and CLIP are measured in the same way. The rendering loss is
+run on real numbers, since it is small.
 """
 
 from __future__ import annotations
@@ -24,12 +24,19 @@ from gdtool.diffusion.network.codec import CHUNK, VaeCodec
 from gdtool.diffusion.network.encoding import PLANES
 from gdtool.diffusion.network.model import Condition, Model, parameter_count, structure
 from gdtool.diffusion.network.schedule import alpha_and_sigma
+from gdtool.diffusion.reports.report import machine
+from gdtool.diffusion.shape.network import PICTURE_CHANNELS, ShapeNetwork
+from gdtool.diffusion.shape.volume import volume_side
+from gdtool.diffusion.training.arithmetic import choose_arithmetic
 from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, rendering_error, view_directions
 
 # Dense bfloat16 peak in FLOP/s, memory in bytes, NVLink in bytes/s in one direction (NVIDIA's data sheets, SXM parts).
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
 # Share of the peak that training a UNet of this size in bfloat16 commonly reaches: an assumption, the only one here.
 UTILISATION = 0.35
+# Share of the speed of one large matrix product (training/arithmetic.py) that a training reaches on a processor: measured with
+# the preset "volume" on a Zen 5 core in bfloat16, both parts alike; norms, copies and attention take the rest.
+CPU_UTILISATION = 0.35
 # Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
 BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
 GB = 1e9
@@ -114,8 +121,8 @@ def step_cost(
     """
     # Two passes, since the FLOP counter keeps tensors alive that checkpointing would have freed.
     counter, memory = FlopCounterMode(display=False), LiveBytes()
-    _one_step(config, domains, views, objects, fused, dtype, device, counter)
-    model = _one_step(config, domains, views, objects, fused, dtype, device, memory)
+    for watch in (counter, memory):
+        model = _one_step(config, domains, views, objects, fused, dtype, device, watch)
     gradients = sum(p.numel() * p.element_size() for p in model.parameters() if p.grad is not None)
     return {"flops": float(counter.get_total_flops()), "bytes": float(memory.peak - gradients)}
 
@@ -147,6 +154,23 @@ def _one_step(
         (predicted - clean).square().mean().backward()
     hook.remove()
     return model
+
+
+def shape_step_cost(config: ModelConfig, objects: int, dtype=torch.bfloat16) -> dict[str, float]:
+    """Measure a forward and backward pass of the shape network, as step_cost() does for that of the views."""
+    assert config.shape is not None
+    counter, memory = FlopCounterMode(display=False), LiveBytes()
+    for watch in (counter, memory):
+        side = volume_side(config.image_size)
+        with torch.device("meta"):
+            network = ShapeNetwork(config.shape, side).to(dtype)
+            picture = torch.zeros(objects, PICTURE_CHANNELS, side, side, dtype=dtype)
+            space = torch.zeros(objects, side, side, side, dtype=dtype)
+            code, known = torch.zeros(objects, config.shape.code, dtype=dtype), torch.zeros(objects, dtype=dtype)
+        with watch:
+            network(picture, space, code, known).square().mean().backward()
+    gradients = sum(p.numel() * p.element_size() for p in network.parameters() if p.grad is not None)
+    return {"flops": float(counter.get_total_flops()), "bytes": float(memory.peak - gradients)}
 
 
 def _empty_condition(model: Model, layout: Layout, dtype) -> Condition:
@@ -283,8 +307,12 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
 
 def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
     """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
-    weights = parameter_count(structure(config))
+    network = structure(config)
+    if train.part == "shape":
+        network = network.shape
+    weights = parameter_count(network)
     frozen = frozen_cost(config)
+    processor = choose_arithmetic("cpu")
     report: dict = {
         "weights": weights,
         "weights_bytes": weights * BYTES_PER_WEIGHT,
@@ -294,11 +322,13 @@ def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
         "phases": [],
         "hours": {},
     }
+    processor_hours = 0.0
     done, hours = 0.0, {(gpu, n): 0.0 for gpu in GPUS for n in (1, 8)}
     for phase in train.phases:
         steps, done = round((phase.share - done) * train.steps), phase.share
         cost = phase_cost(config, train, phase, frozen, weights)
         report["phases"].append({"steps": steps, **cost})
+        processor_hours += steps * cost["flops_per_step"] / (processor.flops * CPU_UTILISATION) / 3600
         for gpu, (peak, _, link) in GPUS.items():
             for n in (1, 8):
                 # Ring all-reduce of float32 gradients.
@@ -315,6 +345,13 @@ def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
             for n in (1, 8)
         }
         report["hours"][gpu] = {"1": hours[gpu, 1], "8": hours[gpu, 8], "fits": fits}
+    report["processor"] = {
+        "name": machine(),
+        "precision": processor.precision,
+        "probe_flops": processor.flops,
+        "utilisation": CPU_UTILISATION,
+        "hours": processor_hours,
+    }
     return report
 
 
@@ -329,8 +366,11 @@ def phase_cost(
     domains, views = min(phase.domains, len(config.domains)), min(phase.views, len(config.views))
     batch = phase.batch or train.batch
     part = -(-batch // train.accumulate)
-    dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
-    one_object, two_objects = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
+    dtype = torch.float32 if train.precision == "float32" else torch.bfloat16
+    if train.part == "shape":
+        one_object, two_objects = (shape_step_cost(config, n, dtype) for n in (1, 2))
+    else:
+        one_object, two_objects = (step_cost(config, domains, views, n, fused=fused, dtype=dtype) for n in (1, 2))
     # both are affine in the number of objects: measured at one and two, not assumed
     flops, network = (one_object[key] + (two_objects[key] - one_object[key]) * (part - 1) for key in ("flops", "bytes"))
     share = rendering_share(config, train, domains)
@@ -380,6 +420,11 @@ def format_plan(report: dict) -> str:
             f"{row[n]:8.1f} h{'' if row['fits'][n] else ' (does not fit: raise accumulate)'}" for n in ("1", "8")
         )
         lines.append(f"{gpu:12s}  1 GPU {one_gpu}   8 GPUs {eight_gpus}")
+    here = report["processor"]
+    lines.append(
+        f"this machine, {here['name']}, in {here['precision']}: {here['hours']:.1f} h, at {here['utilisation']:.0%} of "
+        f"the {here['probe_flops'] / 1e9:.0f} GFLOP/s that a matrix product reached just now"
+    )
     if not report["frozen_parts_counted"]:
         lines.append("not counted: the frozen VAE and CLIP (pip install 'gdtool[hub]')")
     return "\n".join(lines)
