@@ -34,8 +34,8 @@ from gdtool.diffusion.training.losses import SHADED_DOMAINS, LitObject, renderin
 GPUS = {"A100 80 GB": (312e12, 80e9, 300e9), "H100 80 GB": (989e12, 80e9, 450e9), "H200 141 GB": (989e12, 141e9, 450e9)}
 # Share of the peak that training a UNet of this size in bfloat16 commonly reaches: an assumption, the only one here.
 UTILISATION = 0.35
-# Share of the speed of one large matrix product (training/arithmetic.py) that a training reaches on a processor: measured
-# with the preset "volume" on a Zen 5 core in bfloat16, both parts alike.
+# Share of the speed of one large matrix product (training/arithmetic.py) that a training reaches on a processor,
+# measured with the preset "volume" on a Zen 5 core in bfloat16, both parts alike.
 CPU_UTILISATION = 0.35
 # Held for each weight: itself, its gradient, two moments and the average in float32, and autocast's copy in bfloat16.
 BYTES_PER_WEIGHT = 4 + 4 + 8 + 4
