@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +31,23 @@ def choose_domains(asked: tuple[str, ...] | None, config: ModelConfig) -> tuple[
     return domains
 
 
+def sampling_options(chosen: Any, domains: tuple[str, ...]) -> SamplingOptions:
+    """Convert the options of `gdtool sample-views` to those of a sampling of some domains."""
+    return SamplingOptions(
+        domains=domains,
+        steps=chosen.steps,
+        guidance=chosen.guidance,
+        guided_from=chosen.guided_from,
+        guided_to=chosen.guided_to,
+        seed=chosen.seed,
+        scheduler=chosen.scheduler,
+        eta=chosen.eta,
+        spacing=None if chosen.spacing == "auto" else chosen.spacing,
+        precision=chosen.precision,
+        mirror=None if chosen.mirror else False,
+    )
+
+
 def sample_condition(
     model: Model,
     ranges_folder: Path,
@@ -53,7 +71,7 @@ def sample_condition(
     model.unet.to(memory_format=torch.channels_last)
     sample = sample_compiled if compiled else sample_images
     images = sample(model, rgba.to(out.device), options, progress=out.progress)
-    if options.guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
+    if options.used_with(model.config).guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
         out.skip("guidance of some steps", "they are outside --guided-from and --guided-to")
     return images
 
@@ -72,15 +90,14 @@ def warn_of_doubts(
     default options. With other options no warning is given, and the manifest lists the check as skipped.
     """
     default = (
-        options.steps == config.sampling_steps
-        and options.guidance == 1
+        options.used_with(config) == SamplingOptions().used_with(config)
         and options.mirror is None
         and options.domains == config.domains
     )
     if not default:
         out.skip(
             "the model's doubt of its result",
-            "its usual figures were measured with the model's default steps, without guidance, in all domains",
+            "its usual figures were measured with the model's default options, in all domains",
         )
         return
     unsure = describe_doubts(report, read_ranges(ranges_folder))
