@@ -119,7 +119,8 @@ def sample(
             if scheduler == "dpm" and before is not None and last_width > 0:
                 weight = width / (2 * last_width)  # 0 after a step that started from pure noise
                 direction = (1 + weight) * clean - weight * before
-        kept, fresh = s_next, 0.0
+        kept: float = s_next
+        fresh: torch.Tensor | float = 0.0
         if renewal is not None:
             renewed = renewal.eta * (s_next / s) * math.sqrt(max(1 - (a / a_next) ** 2, 0.0))
             kept, fresh = math.sqrt(max(s_next**2 - renewed**2, 0.0)), renewed * renewal.draw()
