@@ -30,6 +30,13 @@ def test_color_is_resized_as_in_pillow(size):
     np.testing.assert_array_equal(out.permute(1, 2, 0).numpy(), expected)
 
 
+def test_autocast_changes_nothing():
+    pixels = torch.from_numpy(random_picture(64, 64)).permute(2, 0, 1).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        resized = resize_bicubic(pixels, 224, 224)
+    assert torch.equal(resized, resize_bicubic(pixels, 224, 224))
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_color_with_alpha_is_resized_as_in_pillow(size):
     pixels = random_picture(*size[:2])

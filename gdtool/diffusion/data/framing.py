@@ -80,10 +80,10 @@ def frame_as_wonder3d(image: np.ndarray, size: int) -> tuple[np.ndarray, Square]
     its last row and column, its longest side becomes WONDER3D_EXTENT * size, the other is rounded down, and it is
     centred to whole pixels (SingleImageDataset.load_image in mvdiffusion/data/single_image_dataset.py).
     """
-    pixels = _eight_bit(image)
-    rows, columns = np.nonzero(pixels[..., 3])
-    left, top = int(columns.min()), int(rows.min())
-    box = pixels[top : max(rows.max(), top + 1), left : max(columns.max(), left + 1)]
+    shown = np.rint(255 * image[..., 3]) > 0
+    rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
+    left, top = int(columns[0]), int(rows[0])
+    box = _eight_bit(image[top : max(int(rows[-1]), top + 1), left : max(int(columns[-1]), left + 1)])
     scale = int(WONDER3D_EXTENT * size) / max(box.shape[:2])
     height, width = (max(int(scale * side), 1) for side in box.shape[:2])
     x, y = (size - width) // 2, (size - height) // 2

@@ -67,8 +67,8 @@ Spacing = Literal["trailing", "leading"]
 class Renewal:
     """Set how much noise each step of DDIM renews (Song et al. 2021, eq. 16).
 
-    eta: 0 is deterministic, 1 renews as much as DDPM does. draw: gives standard normal noise of the latents' shape; it
-    is called once a step, the last one included, as diffusers' DDIMScheduler does.
+    eta: 0 is deterministic, 1 renews as much as DDPM does. draw: gives standard normal noise of the latents' shape. It
+    is called once in every step that does not end at x_0, in the order of the steps, as in diffusers' DDIMScheduler.
     """
 
     eta: float
