@@ -36,9 +36,12 @@ stress: venv
 	$(if $(ASSETS),GDTOOL_MESHES=$(ASSETS)/mesh )$(BIN)/python -m pytest -m slow
 
 # What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, onnxruntime, TensorBoard.
+# WONDER3D_REFERENCE: a folder of small random weights and what the original Wonder3D code answers on them
+# (tests/diffusion/test_wonder3d_reference.py); without it those tests are skipped.
+WONDER3D_REFERENCE ?=
 extras-test: venv
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,matting,tensorboard]" onnx
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/stages/test_train.py
+	$(if $(WONDER3D_REFERENCE),GDTOOL_WONDER3D_REFERENCE=$(abspath $(WONDER3D_REFERENCE)) )$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_wonder3d_sampling.py tests/diffusion/test_wonder3d_reference.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/stages/test_train.py
 
 # A quarter of an hour: damaged files for every reader (what breaks one stays as a test), the whole command line over damaged folders,
 # and a run killed at eleven exact and fifty random moments.

@@ -102,6 +102,14 @@ class ModelConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     # average the predictions for the picture and for its mirror image, in twice the time; patch codec and convention
     # "gdtool" only
     sampling_mirrored: bool = False
+    # further defaults of sample-views: factor of classifier-free guidance, and noise that each step of DDIM renews
+    sampling_guidance: Annotated[float, Meta(ge=0, le=30)] = 1.0
+    sampling_eta: Share = 0.0
+    # timesteps that sampling visits: from the last one down to x_0 ("trailing", Lin et al. 2024), or multiples of
+    # timesteps // steps plus an offset ("leading"), as the schedulers of Stable Diffusion 1 have them
+    sampling_spacing: Literal["trailing", "leading"] = "trailing"
+    sampling_offset: Annotated[int, Meta(ge=0, le=100_000)] = 0  # of leading timesteps
+    sampling_ends_clean: bool = True  # at x_0; otherwise at the noise of timestep 0, which the codec then decodes
     # encoded background of color and albedo while training; sampling uses the first
     backgrounds: Annotated[tuple[Literal["white", "grey", "black"], ...], Meta(min_length=1)] = ("grey",)
     # Network that predicts the shape first; the views are then painted onto its renderings. None: no such network.

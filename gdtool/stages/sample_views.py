@@ -16,13 +16,15 @@ Example:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
 from gdtool.core.kinds import DOMAINS
 from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
+from gdtool.stages.sampling_options import Eta, Guidance, GuidedFrom, GuidedTo, Scheduler, Spacing, Steps
 
 if TYPE_CHECKING:
     import numpy as np
@@ -33,24 +35,13 @@ if TYPE_CHECKING:
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Hold the options of `gdtool sample-views`."""
 
-    steps: (
-        Annotated[
-            int,
-            Meta(ge=1, le=1000, description="Denoising steps; without it the number that measured best for the model."),
-        ]
-        | None
-    ) = None
-    guidance: Annotated[
-        float, Meta(ge=0, le=30, description="Classifier-free guidance; 1: none, and half the time.")
-    ] = 1.0
-    guided_from: Annotated[
-        float, Meta(ge=0, le=1, description="Least noise that guidance acts at, as a share of the timesteps.")
-    ] = 0.0
-    guided_to: Annotated[
-        float,
-        Meta(ge=0, le=1, description="Most noise that guidance acts at. Steps outside of the two take half the time."),
-    ] = 1.0
-    scheduler: Annotated[Literal["ddim", "dpm"], Meta(description="Sampler: DDIM or DPM-Solver++.")] = "ddim"
+    steps: Steps = None
+    guidance: Guidance = None
+    guided_from: GuidedFrom = 0.0
+    guided_to: GuidedTo = 1.0
+    scheduler: Scheduler = "ddim"
+    eta: Eta = None
+    spacing: Spacing = "auto"
     mirror: Annotated[
         bool,
         Meta(
@@ -62,7 +53,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         int, Meta(ge=0, le=MOST_SEED, description="Seed of the noise, the same for every object whatever the order.")
     ] = 0
     domains: Annotated[
-        tuple[str, ...], Meta(description="Domains to write; color is always sampled, since the others depend on it.")
+        tuple[str, ...],
+        Meta(description="Domains to write. They are what a run of all would write: those that they read are sampled."),
     ] = DOMAINS
     mask: Annotated[
         str | None, Meta(description="Picture of the same size that is bright where the subject is.", extra=FILE)
@@ -111,10 +103,15 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.cameras import rig
     from gdtool.diffusion.checkpoint import wonder3d
     from gdtool.diffusion.checkpoint.weights import load_model
-    from gdtool.diffusion.data.condition import PictureOptions, make_condition, trained_extent
-    from gdtool.diffusion.inference.pipeline import Subject, choose_domains, sample_subject, warn_of_doubts
+    from gdtool.diffusion.data.condition import PictureOptions, make_condition
+    from gdtool.diffusion.inference.pipeline import (
+        Subject,
+        choose_domains,
+        sample_subject,
+        sampling_options,
+        warn_of_doubts,
+    )
     from gdtool.diffusion.inference.result import views_from_images
-    from gdtool.diffusion.inference.sampling import SamplingOptions
     from gdtool.diffusion.network.encoding import BACKGROUND
 
     torch.set_num_threads(out.threads)
@@ -124,29 +121,17 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
     domains = choose_domains(None if options.domains == DOMAINS else options.domains, config)
+    settings, of_wonder3d = sampling_options(options, domains), config.convention == "wonder3d"
+    used = asdict(settings.used_with(config))
     with out.step("condition"):
-        extent = trained_extent(config.convention)
-        framing = PictureOptions(options.mask, options.matting, options.crop, extent, config.image_size)
+        framing = PictureOptions(options.mask, options.matting, options.crop, config.image_size, of_wonder3d)
         condition, picture = make_condition(inputs.path, inputs.name, framing, out.warn)
     with out.step("sample"):
-        settings = SamplingOptions(
-            domains=domains,
-            steps=options.steps or config.sampling_steps,
-            guidance=options.guidance,
-            guided_from=options.guided_from,
-            guided_to=options.guided_to,
-            seed=options.seed,
-            mirror=None if options.mirror else False,
-            scheduler=options.scheduler,
-            precision=options.precision,
-        )
-        images, silhouettes = sample_subject(
-            model, folder, Subject(inputs.name, condition), settings, options.compile, out
-        )
-    if config.convention == "wonder3d" and "normal" in images:
+        subject = Subject(inputs.name, condition)
+        images, silhouettes = sample_subject(model, folder, subject, settings, options.compile, out)
+    if of_wonder3d and "normal" in images:
         images["normal"] = wonder3d.premultiplied_normals(images["normal"])
-    rig_name = "wonder3d" if config.convention == "wonder3d" else "six"
-    cameras = {camera.name: camera for camera in rig(rig_name, config.image_size)}
+    cameras = {camera.name: camera for camera in rig("wonder3d" if of_wonder3d else "six", config.image_size)}
     views, report = views_from_images(
         {d: x[0].cpu() for d, x in images.items()},
         [cameras[name] for name in config.views],
@@ -157,12 +142,12 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     )
     warn_of_doubts(folder, report, config, settings, inputs.name, out)
     with out.step("write"):
-        _write(views, report, condition, picture, domains, out)
+        _write(views, report | used, condition, picture, domains, out)
 
 
 def _write(
     views: Views,
-    report: dict[str, float],
+    report: dict[str, Any],
     condition: np.ndarray,
     picture: np.ndarray,
     domains: tuple[str, ...],
@@ -184,7 +169,7 @@ def _write(
 
 STAGE = Stage(
     name="sample-views",
-    version=12,
+    version=13,
     reads=("image-file",),
     networks=True,
     writes="views",

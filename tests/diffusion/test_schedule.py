@@ -9,6 +9,7 @@ import torch
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.network.schedule import (
     DATA_VARIANCE,
+    Renewal,
     alpha_and_sigma,
     clean_from_prediction,
     input_scale,
@@ -19,6 +20,9 @@ from gdtool.diffusion.network.schedule import (
 
 CONFIG = ModelConfig()
 SD = msgspec.structs.replace(CONFIG, noise_schedule="scaled_linear")
+WONDER3D = msgspec.structs.replace(
+    SD, sampling_spacing="leading", sampling_offset=1, sampling_ends_clean=False, prediction="epsilon"
+)
 
 
 @pytest.mark.parametrize("config", [CONFIG, SD])
@@ -63,6 +67,72 @@ def test_min_snr_weight():
 def test_timesteps_start_at_the_last():
     assert timesteps(CONFIG, 4) == [999, 749, 499, 249]
     assert timesteps(CONFIG, 1) == [999]
+
+
+def test_leading_timesteps_are_multiples_and_an_offset():
+    assert timesteps(WONDER3D, 4) == [751, 501, 251, 1]
+    assert timesteps(WONDER3D, 3) == [667, 334, 1]
+    assert timesteps(WONDER3D, 50)[:2] == [981, 961]
+    assert timesteps(CONFIG, 4, "leading") == [750, 500, 250, 0]
+    assert timesteps(WONDER3D, 4, "trailing") == [999, 749, 499, 249]
+
+
+def test_as_many_leading_timesteps_as_there_are_stay_within_the_schedule():
+    assert timesteps(WONDER3D, 1000)[0] == 999
+    assert timesteps(WONDER3D, 1000)[-1] == 1
+
+
+@pytest.mark.parametrize("scheduler", ["ddim", "dpm"])
+def test_a_model_may_end_at_the_noise_of_timestep_0(scheduler):
+    """With the noise known exactly, every step stays on x = a truth + s noise, so the last is at timestep 0."""
+    truth, noise = torch.randn(2, 3), torch.randn(2, 3)
+    a, s = alpha_and_sigma(WONDER3D)
+    start = a[751] * truth + s[751] * noise
+    out = sample(lambda x, t, i: truth, start, WONDER3D, 4, scheduler)
+    torch.testing.assert_close(out, a[0] * truth + s[0] * noise)
+
+
+def test_a_spacing_that_is_not_the_models_own_ends_at_x_0():
+    truth = torch.randn(2, 3)
+    assert torch.equal(sample(lambda x, t, i: truth, torch.randn(2, 3), WONDER3D, 4, "ddim", "trailing"), truth)
+
+
+def test_eta_takes_the_posteriors_standard_deviation():
+    """One step with eta 1 from x to the end, with x_0 predicted as 0: what is added is the noise of DDPM's posterior.
+
+    Its variance is (1 - a'²) / (1 - a²) (1 - a² / a'²) with a' after the step (Ho et al. 2020, eq. 7).
+    """
+    a, _ = (x.double() for x in alpha_and_sigma(WONDER3D))
+    variance = (1 - a[0] ** 2) / (1 - a[1] ** 2) * (1 - a[1] ** 2 / a[0] ** 2)
+    one = torch.ones(1, dtype=torch.float64)
+    out = sample(lambda x, t, i: 0 * x, 0 * one, WONDER3D, 1, "ddim", None, Renewal(1.0, lambda: one))
+    torch.testing.assert_close(out, variance.sqrt().view(1), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.5, 1.0])
+def test_eta_keeps_the_variance(eta):
+    """Predict the true x_0 from any x: at each eta x keeps a truth + s e with e of variance 1, up to the last step."""
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.full((200_000,), 3.0, dtype=torch.float64)
+    a, s = alpha_and_sigma(WONDER3D)
+    seen = []
+
+    def denoise(x, t, i):
+        seen.append(((x - a[t].double() * truth) / s[t].double()).std())
+        return truth
+
+    def draw():
+        return torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+
+    sample(denoise, a[751].double() * truth + s[751].double() * draw(), WONDER3D, 4, "ddim", None, Renewal(eta, draw))
+    torch.testing.assert_close(torch.stack(seen), torch.ones(4, dtype=torch.float64), rtol=0.01, atol=0)
+
+
+def test_noise_is_drawn_at_every_step_the_last_one_included():
+    draws = []
+    renewal = Renewal(1.0, lambda: draws.append(1) or torch.zeros(2))
+    sample(lambda x, t, i: x, torch.zeros(2), WONDER3D, 4, "ddim", None, renewal)
+    assert len(draws) == 4
 
 
 @pytest.mark.parametrize("scheduler", ["ddim", "dpm"])

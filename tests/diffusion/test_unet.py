@@ -4,10 +4,10 @@ import msgspec
 import pytest
 import torch
 
-from gdtool.core.errors import InputError
+from gdtool.core.errors import InputError, UsageError
 from gdtool.diffusion.checkpoint.weights import load_stable_diffusion
 from gdtool.diffusion.config import PRESETS
-from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
+from gdtool.diffusion.inference.sampling import SamplingOptions, SamplingSettings, sample_images, sampled_domains
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.encoding import mirror_images
 from gdtool.diffusion.network.model import Model
@@ -45,13 +45,19 @@ def test_the_paper_preset_has_stable_diffusions_keys_and_size():
     assert original == 859_520_964 + 4 * 320 * 9
 
 
-def small_stable_diffusion():
+def small_stable_diffusion(cross_domain="two_way"):
     """Return this network, Stable Diffusion's, and the weights of the latter, all small.
 
     Stable Diffusion's has 4 input channels, no classes and no attention across domains.
     """
     config = msgspec.structs.replace(
-        PAPER, channels=(8, 16, 16, 16), heads=2, norm_groups=4, encoder_width=12, gradient_checkpointing=False
+        PAPER,
+        channels=(8, 16, 16, 16),
+        heads=2,
+        norm_groups=4,
+        encoder_width=12,
+        gradient_checkpointing=False,
+        cross_domain=cross_domain,
     )
     torch.manual_seed(0)
     grown = UNet(config, 4, 4, 8)
@@ -60,25 +66,32 @@ def small_stable_diffusion():
     return grown, plain, weights
 
 
-def test_pretrained_weights_start_unchanged():
+@pytest.mark.parametrize("cross_domain", ["none", "one_way", "two_way", "joint", "joint_last"])
+def test_pretrained_weights_start_unchanged(cross_domain):
     """Load pretrained weights into the network with its new parts: every image gets the original network's output.
 
-    There is one view, so that multi-view attention is self-attention, and the class embedding is zero.
+    There is one view, so that multi-view attention is self-attention.
     """
-    grown, plain, weights = small_stable_diffusion()
+    grown, plain, weights = small_stable_diffusion(cross_domain)
     new = load_stable_diffusion(grown, weights)
-    assert all("cross_domain" in name or "class_embedding" in name for name in new)
-    for network in (grown, plain):
-        for p in network.class_embedding.parameters():
-            torch.nn.init.zeros_(p)
+    assert all("domain" in name or "joint" in name or "class_embedding" in name for name in new)
+    for p in plain.class_embedding.parameters():
+        torch.nn.init.zeros_(p)
     layout, context, t = Layout(1, (0, 1, 2), 1), torch.randn(1, 1, 12), torch.tensor([500])
-    noisy, condition, label = torch.randn(3, 4, 8, 8), torch.randn(3, 4, 8, 8), torch.zeros(3, 18)
+    noisy, condition, label = torch.randn(3, 4, 8, 8), torch.randn(3, 4, 8, 8), torch.randn(3, 18)
     torch.testing.assert_close(
         grown(noisy, condition, t, label, context, layout),
         plain(noisy, torch.zeros(3, 0, 8, 8), t, label, context, layout),
         rtol=1e-5,
         atol=1e-5,
     )
+
+
+def test_pretrained_weights_of_a_class_embedding_are_kept():
+    grown, _, weights = small_stable_diffusion()
+    own = {"class_embedding.linear_2.weight": torch.ones(32, 32)}
+    load_stable_diffusion(grown, weights | own)
+    assert bool((grown.class_embedding.linear_2.weight == 1).all())
 
 
 def test_pretrained_weights_that_do_not_fit_are_named():
@@ -197,16 +210,64 @@ def test_only_a_patch_codec_samples_with_the_mirror_image():
     assert sample_images(half, torch.rand(1, 4, 16, 16), SamplingOptions(steps=1))["color"].shape[1] == 2
 
 
-def test_domains_that_are_not_requested_are_not_computed():
-    model = tiny()
-    rgba = torch.rand(1, 4, 16, 16)
-    assert set(sample_images(model, rgba, SamplingOptions(steps=1, domains=("depth",)))) == {"color", "depth"}
-    alone = tiny(cross_domain="none")
-    subset, whole = (
-        sample_images(alone, rgba, SamplingOptions(steps=2, domains=d)) for d in (("depth",), TINY.domains)
+# what is sampled for depth alone, and for color alone, by the attention across domains
+SAMPLED_WITH = {
+    "none": (("depth",), ("color",)),
+    "one_way": (("depth",), TINY.domains),
+    "two_way": (TINY.domains, TINY.domains),
+    "joint": (TINY.domains, TINY.domains),
+    "joint_last": (TINY.domains, TINY.domains),
+}
+
+
+@pytest.mark.parametrize("mode", SAMPLED_WITH)
+def test_domains_that_others_read_are_sampled_with_them(mode):
+    config = msgspec.structs.replace(TINY, cross_domain=mode)
+    assert (sampled_domains(config, ("depth",)), sampled_domains(config, ("color",))) == SAMPLED_WITH[mode]
+
+
+def test_a_star_without_color_reads_no_other_domain():
+    config = msgspec.structs.replace(TINY, cross_domain="two_way", domains=("normal", "depth"))
+    assert sampled_domains(config, ("depth",)) == ("depth",)
+
+
+@pytest.mark.parametrize("domain", ["color", "depth"])
+@pytest.mark.parametrize("mode", SAMPLED_WITH)
+def test_a_domain_does_not_depend_on_which_others_are_asked_for(mode, domain):
+    model, rgba = tiny(cross_domain=mode), torch.rand(1, 4, 16, 16)
+    alone, whole = (sample_images(model, rgba, SamplingOptions(steps=2, domains=d)) for d in ((domain,), TINY.domains))
+    assert set(alone) == set(sampled_domains(model.config, (domain,)))
+    torch.testing.assert_close(alone[domain], whole[domain], rtol=1e-4, atol=1e-5)
+
+
+def test_renewed_noise_is_the_seeds():
+    model, rgba = tiny(sampling_eta=1.0), torch.rand(1, 4, 16, 16)
+    first, again = (sample_images(model, rgba, SamplingOptions(steps=3, seed=4))["color"] for _ in range(2))
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, sample_images(model, rgba, SamplingOptions(steps=3, seed=4, eta=0.0))["color"])
+
+
+def test_renewed_noise_does_not_depend_on_the_batch_or_the_domains():
+    model, rgba = tiny(sampling_eta=1.0, cross_domain="none"), torch.rand(2, 4, 16, 16)
+    both = sample_images(model, rgba, SamplingOptions(steps=3, seed=4))
+    alone = sample_images(model, rgba[1:], SamplingOptions(steps=3, seed=4, domains=("depth",)))
+    torch.testing.assert_close(both["depth"][1], alone["depth"][0], rtol=1e-4, atol=1e-5)
+
+
+def test_the_models_own_settings_are_used_where_none_are_given():
+    config = msgspec.structs.replace(
+        TINY, sampling_steps=7, sampling_guidance=3.0, sampling_eta=0.5, sampling_spacing="leading"
     )
-    assert set(subset) == {"depth"}
-    torch.testing.assert_close(subset["depth"], whole["depth"], rtol=1e-4, atol=1e-5)
+    assert SamplingOptions().used_with(config) == SamplingSettings(7, 3.0, 0.5, "leading")
+    given = SamplingOptions(steps=2, guidance=1.0, eta=0.0, spacing="trailing")
+    assert given.used_with(config) == SamplingSettings(2, 1.0, 0.0, "trailing")
+
+
+def test_dpm_renews_no_noise():
+    config = msgspec.structs.replace(TINY, sampling_eta=1.0)
+    assert SamplingOptions(scheduler="dpm").used_with(config).eta == 0
+    with pytest.raises(UsageError, match="--eta"):
+        SamplingOptions(scheduler="dpm", eta=0.5).used_with(config)
 
 
 def test_bfloat16_stays_near_float32():

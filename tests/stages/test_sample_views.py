@@ -110,10 +110,26 @@ def test_a_subset_of_the_domains(gdtool, picture, tiny_model, tmp_path):
     assert result.returncode == 0, result.stderr
     content = json.loads((tmp_path / "ball.asset/views" / MANIFEST).read_text())["content"]
     assert content["domains"] == ["normal", "depth"]
+    assert [content["report"][name] for name in ("steps", "guidance", "eta", "spacing")] == [2, 2.0, 0.0, "trailing"]
     assert not (tmp_path / "ball.asset/views/color").exists()
     wrong = sample(gdtool, "ball.png", "--model", tiny_model, "--domains", "normals")
     assert wrong.returncode == 2
     assert "normals" in wrong.stderr
+
+
+def test_a_subset_is_what_a_run_of_all_domains_writes(gdtool_here, picture, tiny_model, tmp_path):
+    for name, more in (("all", ()), ("some", ("--domains", "albedo,normal"))):
+        made = sample(gdtool_here, "ball.png", "--model", tiny_model, *more, "-o", name)
+        assert made.returncode == 0, made.stderr
+    whole = bytes_of(tmp_path / "all")
+    for path, content in bytes_of(tmp_path / "some").items():
+        assert path.name == "contact_sheet.png" or whole[path] == content, path
+
+
+def test_renewed_noise_is_asked_of_ddim_alone(gdtool_here, picture, tiny_model):
+    refused = sample(gdtool_here, "ball.png", "--model", tiny_model, "--scheduler", "dpm", "--eta", 1)
+    assert refused.returncode == 2
+    assert "--eta" in refused.stderr
 
 
 @pytest.mark.slow

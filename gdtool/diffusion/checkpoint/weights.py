@@ -19,6 +19,13 @@ OTHER_WEIGHTS = "give the config.json that these weights were trained with"
 OTHER_START = (
     'set "pretrained" to a Stable Diffusion 1 of that structure, such as lambdalabs/sd-image-variations-diffusers'
 )
+# last layers of the parts that Stable Diffusion's UNet lacks
+NEW_OUTPUTS = (
+    "class_embedding.linear_2.",
+    "attn_cross_domain.to_out.0.",
+    "attn_joint_mid.to_out.0.",
+    "attn_joint_last.to_out.0.",
+)
 
 
 def check_shapes(path: Path, tensors: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> None:
@@ -110,8 +117,10 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
     """Copy Stable Diffusion's weights, named as in diffusers, into a UNet.
 
     The UNet's conv_in has more input channels (for the condition), and its class embedding more inputs (for the
-    domains). The added columns are zero. Returns the names of the parameters that keep their initial values. Raises
-    InputError for a tensor that the UNet lacks or that has another shape.
+    domains). The added columns are zero. What the weights lack adds nothing at first: the class embedding's last layer
+    and the projections after attention across domains are zero, so that a single view's answer is Stable Diffusion's in
+    every domain. Returns the names of the parameters that the weights lack. Raises InputError for a tensor that the
+    UNet lacks or that has another shape.
     """
     state = unet.state_dict()
     for name, tensor in tensors.items():
@@ -129,5 +138,9 @@ def load_stable_diffusion(unet, tensors: dict[str, torch.Tensor]) -> list[str]:
                 OTHER_START,
             )
         state[name] = tensor
+    new = sorted(set(state) - set(tensors))
+    for name in new:
+        if any(layer in name for layer in NEW_OUTPUTS):
+            state[name] = torch.zeros_like(state[name])
     unet.load_state_dict(state)
-    return sorted(set(state) - set(tensors))
+    return new

@@ -1,15 +1,14 @@
 """Load a published Wonder3D v1 folder (Long et al. 2023, flamehaze1115/wonder3d-v1.0) as a Model.
 
 The folder holds unet/ vae/ image_encoder/ scheduler/ of diffusers. The network is Stable Diffusion's with
-attn_joint_mid in each block. It makes normal and color in six views over white; the picture's subject fills 192 of 256
-pixels. Facts are from the repository xxlong0/Wonder3D (mvdiffusion/models/transformer_mv2d.py,
-data/single_image_dataset.py, pipelines/).
+attn_joint_mid in each block. It makes normal and color in six views over white. Facts are from the repository
+xxlong0/Wonder3D (mvdiffusion/models/transformer_mv2d.py, pipelines/, configs/mvdiffusion-joint-ortho-6views.yaml).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import torch
@@ -23,7 +22,7 @@ from gdtool.diffusion.network.labels import WONDER3D_LABEL_WIDTH
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.tensors import read_tensors
 
-EXTENT = 192 / 256
+STEPS, GUIDANCE, ETA = 50, 3.0, 1.0  # of sampling, in the original's configuration and pipeline
 UNET = "unet/diffusion_pytorch_model.safetensors"
 NEAREST_NORMAL = 3**0.5 - 1  # from white (1, 1, 1), encoded, to the nearest unit normal
 OLDER_KEYS = (
@@ -54,10 +53,23 @@ class _UNet(msgspec.Struct):
 
 
 class _Scheduler(msgspec.Struct):
-    """Hold the fields that are read from scheduler/scheduler_config.json."""
+    """Hold the fields that are read from scheduler/scheduler_config.json, with DDIMScheduler's defaults.
+
+    Fields that older versions of diffusers did not write have the values of Wonder3D's own file.
+    """
 
     beta_schedule: str | None = None
+    beta_start: float = 0.00085
+    beta_end: float = 0.012
+    num_train_timesteps: int = 1000
     prediction_type: str = "epsilon"
+    clip_sample: bool = False
+    thresholding: bool = False
+    rescale_betas_zero_snr: bool = False
+    trained_betas: list[float] | None = None
+    timestep_spacing: Literal["leading", "trailing"] = "leading"
+    steps_offset: Annotated[int, Meta(ge=0, le=1000)] = 0
+    set_alpha_to_one: bool = True
 
 
 def recognises(folder: Path) -> bool:
@@ -80,17 +92,15 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
     """
     path = folder / "unet" / "config.json"
     unet = _read(path, _UNet)
-    scheduler = _read(folder / "scheduler" / "scheduler_config.json", _Scheduler)
-    facts = {
-        "in_channels": (unet.in_channels, 8),
-        "class_embed_type": (unet.class_embed_type, "projection"),
-        "projection_class_embeddings_input_dim": (unet.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
-        "beta_schedule": (scheduler.beta_schedule, "scaled_linear"),
-        "prediction_type": (scheduler.prediction_type, "epsilon"),
-    }
-    for name, (value, wanted) in facts.items():
-        if value != wanted:
-            raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
+    _require(
+        path,
+        {
+            "in_channels": (unet.in_channels, 8),
+            "class_embed_type": (unet.class_embed_type, "projection"),
+            "projection_class_embeddings_input_dim": (unet.projection_class_embeddings_input_dim, WONDER3D_LABEL_WIDTH),
+        },
+    )
+    scheduler = _read_scheduler(folder / "scheduler" / "scheduler_config.json")
     if not isinstance(unet.attention_head_dim, int):
         raise InputError(path, "has a different number of heads at each level, and Wonder3D the same", OTHER_FOLDER)
     return parse_config(
@@ -116,11 +126,42 @@ def read_config(folder: Path, tensors: dict[str, torch.Tensor]) -> ModelConfig:
             "encoder_width": unet.cross_attention_dim,
             "prediction": "epsilon",
             "noise_schedule": "scaled_linear",
+            "sampling_steps": STEPS,
+            "sampling_guidance": GUIDANCE,
+            "sampling_eta": ETA,
+            "sampling_spacing": scheduler.timestep_spacing,
+            "sampling_offset": scheduler.steps_offset,
+            "sampling_ends_clean": scheduler.set_alpha_to_one,
             "backgrounds": ("white",),
             "pretrained": str(folder),
         },
         path,
     )
+
+
+def _read_scheduler(path: Path) -> _Scheduler:
+    """Read a scheduler's configuration. Raises InputError for noise or predictions other than Wonder3D's."""
+    scheduler = _read(path, _Scheduler)
+    wanted = {
+        "beta_schedule": "scaled_linear",
+        "beta_start": 0.00085,
+        "beta_end": 0.012,
+        "num_train_timesteps": 1000,
+        "prediction_type": "epsilon",
+        "clip_sample": False,
+        "thresholding": False,
+        "rescale_betas_zero_snr": False,
+        "trained_betas": None,
+    }
+    _require(path, {name: (getattr(scheduler, name), value) for name, value in wanted.items()})
+    return scheduler
+
+
+def _require(path: Path, facts: dict[str, tuple[object, object]]) -> None:
+    """Raise InputError for the first field of a file whose value differs; facts: value and Wonder3D's, by name."""
+    for name, (value, wanted) in facts.items():
+        if value != wanted:
+            raise InputError(path, f"has {name} {value!r}, Wonder3D {wanted!r}", OTHER_FOLDER)
 
 
 def load(folder: Path):

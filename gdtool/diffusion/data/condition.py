@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from gdtool.core.errors import InputError
-from gdtool.diffusion.data.framing import FRONT_EXTENT, frame, framed_side, whole_frame
+from gdtool.diffusion.data.framing import (
+    Square,
+    frame_as_wonder3d,
+    framed_square,
+    resample,
+    whole_frame,
+    whole_frame_as_wonder3d,
+)
 from gdtool.images.color import linear_from_srgb, srgb_from_linear
 from gdtool.images.io import read_image
 from gdtool.images.mask import foreground
@@ -23,15 +30,15 @@ class PictureOptions:
     """Set how a picture becomes a condition.
 
     mask: path of an image that is bright where the subject is. matting: path of an ONNX network that separates the
-    subject. crop: centre and scale the subject as in training; otherwise the picture's framing stays. extent: longest
-    side of the framed subject, as a share of the image. size: side of the condition in pixels.
+    subject. crop: centre and scale the subject as in training; otherwise the picture's framing stays. size: side of the
+    condition in pixels. wonder3d: frame as Wonder3D's data set does, for its weights.
     """
 
     mask: str | None
     matting: str | None
     crop: bool
-    extent: float
     size: int
+    wonder3d: bool = False
 
 
 def mask_size_error(mask: str, size: tuple[int, ...], wanted: tuple[int, ...]) -> InputError:
@@ -47,8 +54,9 @@ def make_condition(
     """Read a picture, cut its subject out and frame it, at the model's size and at about the picture's resolution.
 
     Returns two images of the same square: (size, size, 4) and (f size, f size, 4), float32, linear color and straight
-    alpha. The whole number f, 1 to MAX_FINER, keeps the picture's resolution best. warn: called with a text where the
-    subject may be cut off. Raises InputError for a picture without a usable subject.
+    alpha. The whole number f, 1 to MAX_FINER, keeps the picture's resolution best. With options.wonder3d the sRGB
+    values of the first are whole multiples of 1/255. warn: called with a text where the subject may be cut off. Raises
+    InputError for a picture without a usable subject.
     """
     image = read_image(path)
     if min(image.shape[:2]) < MIN_PICTURE_SIDE:
@@ -77,20 +85,23 @@ def make_condition(
     if not linear:
         color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
     rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
-    size, extent = options.size, options.extent
-    finer = (framed_side(rgba, extent) if options.crop else max(rgba.shape[:2])) / size
-    condition, picture = (
-        frame(rgba, side, extent) if options.crop else whole_frame(rgba, side)
-        for side in (size, size * min(max(round(finer), 1), MAX_FINER))
-    )
-    return condition, picture
+    return _framed(rgba, options)
 
 
-def trained_extent(convention: str) -> float:
-    """Return the longest side of the framed subject, as a share of the image, that a model was trained with."""
-    from gdtool.diffusion.checkpoint import wonder3d
-
-    return wonder3d.EXTENT if convention == "wonder3d" else FRONT_EXTENT
+def _framed(rgba: np.ndarray, options: PictureOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Frame rgba (h, w, 4), linear color and straight alpha, at the model's size and about at its own resolution."""
+    size, square = options.size, Square(0.0, 0.0, float(max(rgba.shape[:2])))
+    if options.wonder3d and options.crop:
+        condition, square = frame_as_wonder3d(rgba, size)
+    elif options.wonder3d:
+        condition = whole_frame_as_wonder3d(rgba, size)
+    elif options.crop:
+        square = framed_square(rgba)
+        condition = resample(rgba, square, size)
+    else:
+        condition = whole_frame(rgba, size)
+    finer = size * min(max(round(square.side / size), 1), MAX_FINER)
+    return condition, resample(rgba, square, finer) if options.crop else whole_frame(rgba, finer)
 
 
 def encode_rgba(image: np.ndarray) -> np.ndarray:

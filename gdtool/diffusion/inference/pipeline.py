@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,6 +32,23 @@ def choose_domains(asked: tuple[str, ...] | None, config: ModelConfig) -> tuple[
             f"choose from {','.join(config.domains)}",
         )
     return domains
+
+
+def sampling_options(chosen: Any, domains: tuple[str, ...]) -> SamplingOptions:
+    """Convert the options of `gdtool sample-views` to those of a sampling of some domains."""
+    return SamplingOptions(
+        domains=domains,
+        steps=chosen.steps,
+        guidance=chosen.guidance,
+        guided_from=chosen.guided_from,
+        guided_to=chosen.guided_to,
+        seed=chosen.seed,
+        scheduler=chosen.scheduler,
+        eta=chosen.eta,
+        spacing=None if chosen.spacing == "auto" else chosen.spacing,
+        precision=chosen.precision,
+        mirror=None if chosen.mirror else False,
+    )
 
 
 @dataclass(frozen=True)
@@ -77,7 +94,7 @@ def sample_subject(
         mirror = averages_mirror_image(model.config, options)
         guides = make_guides(model, rgba, subject.known, seed=options.seed or None, mirror=mirror)
     images = sample(model, rgba, options, guides=guides, known=subject.known, progress=out.progress)
-    if options.guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
+    if options.used_with(model.config).guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
         out.skip("guidance of some steps", "they are outside --guided-from and --guided-to")
     return Sampled(images, None if guides is None else guides.mask[0].cpu())
 
@@ -96,15 +113,14 @@ def warn_of_doubts(
     default options. With other options no warning is given, and the manifest lists the check as skipped.
     """
     default = (
-        options.steps == config.sampling_steps
-        and options.guidance == 1
+        options.used_with(config) == SamplingOptions().used_with(config)
         and options.mirror is None
         and options.domains == config.domains
     )
     if not default:
         out.skip(
             "the model's doubt of its result",
-            "its usual figures were measured with the model's default steps, without guidance, in all domains",
+            "its usual figures were measured with the model's default options, in all domains",
         )
         return
     unsure = describe_doubts(report, read_ranges(ranges_folder))

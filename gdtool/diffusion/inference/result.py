@@ -143,9 +143,7 @@ def views_from_images(
     if part is not None and front is not None:
         mask = add_part_to_masks(part, mask, cameras, front)
     out = {}
-    for domain in images:
-        if domain not in domains:
-            continue
+    for domain in images:  # those left out below as well: others are corrected by them
         value = values[domain].numpy()
         if domain in ("color", "albedo"):
             value = linear_from_srgb(np.moveaxis(value, 1, -1))
@@ -168,4 +166,4 @@ def views_from_images(
     if part is not None and front is not None:
         draw_part(part, out, before, cameras, front)
         report["drawn_share"] = float(part.lost.sum() / (mask[front] > 0.5).sum())
-    return Views(cameras, out, mask.astype(np.float32)), report
+    return Views(cameras, {d: out[d] for d in out if d in domains}, mask.astype(np.float32)), report

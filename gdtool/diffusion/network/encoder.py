@@ -10,7 +10,10 @@ from gdtool.core.errors import ResourceError
 from gdtool.core.native import imported_if_installed
 from gdtool.diffusion.config import ENCODER_HEAD_WIDTH, ModelConfig
 from gdtool.diffusion.network.attention import Attention, FeedForward, learned_position
+from gdtool.diffusion.network.eight_bit import resize_bicubic
 from gdtool.diffusion.network.tensors import pretrained_part
+
+CLIP_SIDE = 224  # pixels of the square picture that CLIP ViT-L/14 reads
 
 
 class EncoderLayer(nn.Module):
@@ -57,7 +60,7 @@ class ClipEncoder(nn.Module):
     """Encode the condition as one 768-wide token, the projected embedding of a frozen CLIP ViT-L/14.
 
     Stable Diffusion Image Variations does the same. Its model card resizes pictures bicubically without antialiasing.
-    Wonder3D resizes them with CLIP's processor, which antialiases.
+    Wonder3D resizes them with CLIP's processor, which antialiases and works in 8 bits.
     """
 
     # mean and deviation of CLIP's training images (openai/clip-vit-large-patch14, preprocessor_config.json)
@@ -75,18 +78,26 @@ class ClipEncoder(nn.Module):
             clip = CLIPVisionModelWithProjection.from_pretrained(
                 pretrained_part(config, "image_encoder"), use_safetensors=True
             )
-        self.antialias = config.convention == "wonder3d"
+        self.eight_bit = config.convention == "wonder3d"
         # in a list, so that its weights are neither trained nor saved with the model's
         self.frozen = [clip.requires_grad_(False).eval()]
 
     def forward(self, rgba):
         """Map rgba (b, 4, h, w) in [-1, 1] to one token (b, 1, 768)."""
         clip = self.frozen[0].to(rgba.device)
-        image = F.interpolate(0.5 + 0.5 * rgba[:, :3], size=(224, 224), mode="bicubic", antialias=self.antialias)
-        image = image.clamp(0, 1) if self.antialias else image  # as after quantising to 8 bits
-        mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
         with torch.no_grad():
-            return clip((image - mean) / deviation).image_embeds.unsqueeze(1)
+            return clip(self.pixels(rgba)).image_embeds.unsqueeze(1)
+
+    def pixels(self, rgba):
+        """Resize and normalise rgba (b, 4, h, w) in [-1, 1] to CLIP's input (b, 3, CLIP_SIDE, CLIP_SIDE)."""
+        image = 0.5 + 0.5 * rgba[:, :3]
+        if self.eight_bit:
+            pixels = (255 * image).round().clamp(0, 255).cpu()
+            image = torch.stack([resize_bicubic(p, CLIP_SIDE, CLIP_SIDE) for p in pixels]).to(rgba.device) / 255
+        else:
+            image = F.interpolate(image, size=(CLIP_SIDE, CLIP_SIDE), mode="bicubic")
+        mean, deviation = (torch.tensor(x, device=rgba.device)[:, None, None] for x in (self.MEAN, self.DEVIATION))
+        return (image - mean) / deviation
 
 
 def make_encoder(config: ModelConfig) -> nn.Module:

@@ -10,8 +10,7 @@ from gdtool.cameras.camera import SIX_VIEWS
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig
 
-# Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them, in half
-# precision.
+# Wonder3D's elevation and azimuth (radians) of each view relative to the picture's, as its pipeline has them.
 ELEVATION = {
     "front": 0.0,
     "front_right": -0.2362,
@@ -46,14 +45,15 @@ def class_labels(config: ModelConfig) -> torch.Tensor:
 def _wonder3d_labels(config: ModelConfig) -> torch.Tensor:
     """Compute Wonder3D's labels (domains, views, 10): the sines, then the cosines of raw values.
 
-    The raw values are [elevation of the condition, elevation, azimuth, two switches for the domain]. The switches are 0
-    for domains that Wonder3D does not have.
+    The raw values are [elevation of the condition, elevation, azimuth, two switches for the domain], in half precision.
+    The switches are 0 for domains that Wonder3D does not have.
     """
     raw = torch.tensor(
         [
             [[0.0, ELEVATION[view], AZIMUTH[view], *SWITCH.get(domain, (0.0, 0.0))] for view in config.views]
             for domain in DOMAINS
         ],
+        dtype=torch.float16,
         device="cpu",
-    )
+    ).float()
     return torch.cat([raw.sin(), raw.cos()], -1)

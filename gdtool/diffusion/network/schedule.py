@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 
@@ -58,9 +60,31 @@ def loss_weight(a: torch.Tensor, s: torch.Tensor, gamma: float, floor: float) ->
     return (a * a / (s * s).clamp_min(1e-8)).clamp(max=gamma).clamp(min=floor)
 
 
-def timesteps(config: ModelConfig, steps: int) -> list[int]:
-    """Return `steps` decreasing timesteps that start at the last one ("trailing" spacing, Lin et al. 2024)."""
-    return [max(round(config.timesteps * (1 - i / steps)) - 1, 0) for i in range(steps)]
+Spacing = Literal["trailing", "leading"]
+
+
+@dataclass(frozen=True)
+class Renewal:
+    """Set how much noise each step of DDIM renews (Song et al. 2021, eq. 16).
+
+    eta: 0 is deterministic, 1 renews as much as DDPM does. draw: gives standard normal noise of the latents' shape. It
+    is called once in every step that does not end at x_0, in the order of the steps, as in diffusers' DDIMScheduler.
+    """
+
+    eta: float
+    draw: Callable[[], torch.Tensor]
+
+
+def timesteps(config: ModelConfig, steps: int, spacing: Spacing | None = None) -> list[int]:
+    """Return `steps` decreasing timesteps that sampling visits.
+
+    spacing: "trailing" starts at the last timestep (Lin et al. 2024); "leading" takes the multiples of
+    timesteps // steps and adds config.sampling_offset, as diffusers does; None is the configuration's.
+    """
+    n = config.timesteps
+    if (spacing or config.sampling_spacing) == "leading":
+        return [min(i * (n // steps) + config.sampling_offset, n - 1) for i in reversed(range(steps))]
+    return [max(round(n * (1 - i / steps)) - 1, 0) for i in range(steps)]
 
 
 def sample(
@@ -69,28 +93,38 @@ def sample(
     config: ModelConfig,
     steps: int,
     scheduler: str,
+    spacing: Spacing | None = None,
+    renewal: Renewal | None = None,
 ) -> torch.Tensor:
     """Integrate from noise (n, c, h, w) to x_0 in `steps` steps.
 
-    denoise(x, timestep, step's number) predicts x_0. scheduler: "ddim" (Song et al. 2021, deterministic) or "dpm",
-    DPM-Solver++(2M) (Lu et al. 2022, algorithm 2).
+    denoise(x, timestep, step's number) predicts x_0. scheduler: "ddim" (Song et al. 2021) or "dpm", DPM-Solver++(2M)
+    (Lu et al. 2022, algorithm 2). spacing: see timesteps(). renewal: for DDIM; without it each step is deterministic.
+    The configuration's own spacing ends where sampling_ends_clean says, another one at x_0.
     """
     alpha, sigma = alpha_and_sigma(config)
-    steps_at = timesteps(config, steps)
+    steps_at = timesteps(config, steps, spacing)
+    ends_clean = config.sampling_ends_clean or spacing not in (None, config.sampling_spacing)
+    levels = [(float(alpha[t]), float(sigma[t])) for t in steps_at]
+    levels.append((1.0, 0.0) if ends_clean else (float(alpha[0]), float(sigma[0])))
     x, before, last_width = noise, None, math.inf
     for i, t in enumerate(steps_at):
         clean = denoise(x, t, i)
-        if i == len(steps_at) - 1:
+        (a, s), (a_next, s_next) = levels[i : i + 2]
+        if s_next == 0:
             return clean
-        a, s = float(alpha[t]), float(sigma[t])
-        a_next, s_next = float(alpha[steps_at[i + 1]]), float(sigma[steps_at[i + 1]])
         direction, width = clean, math.inf
         if a > 1e-6:
             width = math.log(a_next / s_next) - math.log(a / s)  # half log-SNR
-            if scheduler == "dpm" and before is not None:
+            if scheduler == "dpm" and before is not None and last_width > 0:
                 weight = width / (2 * last_width)  # 0 after a step that started from pure noise
                 direction = (1 + weight) * clean - weight * before
+        kept: float = s_next
+        fresh: torch.Tensor | float = 0.0
+        if renewal is not None:
+            renewed = renewal.eta * (s_next / s) * math.sqrt(max(1 - (a / a_next) ** 2, 0.0))
+            kept, fresh = math.sqrt(max(s_next**2 - renewed**2, 0.0)), renewed * renewal.draw()
         # a_next x0 + s_next e with e from x and x0: DDIM, and DPM-Solver++ once x0 is extrapolated
-        x = a_next * direction + s_next * (x - a * direction) / s
+        x = a_next * direction + kept * (x - a * direction) / s + fresh
         before, last_width = clean, width
     return x
