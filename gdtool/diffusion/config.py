@@ -28,6 +28,7 @@ Rate = Annotated[float, Meta(ge=0, le=10)]  # learning rate
 Share = Annotated[float, Meta(ge=0, le=1)]
 Weight = Annotated[float, Meta(ge=0, le=1e6)]  # of a part of the loss
 MAX_LEVELS = 8  # resolutions of the UNet
+MOST_STEPS = 10**9  # of a training
 ENCODER_HEAD_WIDTH = 64  # channels of each attention head of the patch encoder
 
 
@@ -216,7 +217,7 @@ class TrainConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     part: Literal["views", "shape"] = "views"  # of the model that is trained; the other part stays as it is
     batch: Annotated[int, Meta(ge=1, le=1_000_000)] = 8
     accumulate: Annotated[int, Meta(ge=1, le=1_000_000)] = 1
-    steps: Annotated[int, Meta(ge=1, le=10**9)] = 4000
+    steps: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 4000
     # The last phase has all images at once, as sampling does, and few objects, so that a step costs about the same.
     phases: Annotated[tuple[Phase, ...], Meta(min_length=1, max_length=100)] = (
         Phase(share=0.6, domains=3, views=3),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
 from gdtool.core.errors import InputError, UsageError
 from gdtool.core.reading import read_json
-from gdtool.diffusion.config import ABLATIONS, PRESETS, SHAPE_TRAINING, ModelConfig, TrainConfig
+from gdtool.diffusion.config import ABLATIONS, MOST_STEPS, PRESETS, SHAPE_TRAINING, ModelConfig, TrainConfig
 
 
 def configuration(
@@ -57,3 +57,13 @@ def configuration(
 
         model = resize_config(model, size)
     return model, train
+
+
+def chosen_configuration(options: Any) -> tuple[ModelConfig, TrainConfig]:
+    """Return the configurations that the options of `gdtool train` choose. Raises InputError and UsageError."""
+    # Without --steps the minutes decide when the training ends.
+    steps = MOST_STEPS if options.minutes is not None and options.steps is None else options.steps
+    precision = None if options.precision == "auto" else options.precision
+    flags = {"steps": steps, "batch": options.batch, "precision": precision}
+    values = {name: value for name, value in flags.items() if value is not None}
+    return configuration(options.preset, options.part, options.ablation, options.config, values, options.size)

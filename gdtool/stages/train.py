@@ -34,10 +34,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     preset: Annotated[
         Literal["volume", "small", "tiny", "paper"],
-        Meta(
-            description="Configuration to start from. volume: the shape first, then the views on it. small, paper: "
-            "views alone, as the paper has them, at two sizes. tiny: for tests."
-        ),
+        Meta(description="volume: the shape first, then views on it. small, paper: views alone. tiny: for tests."),
     ] = "small"
     part: Annotated[
         Literal["views", "shape"],
@@ -104,9 +101,10 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 def check(inputs: Inputs, options: Options) -> None:
     """Refuse, before the run, a bad --config, --tensorboard without its package, and too many --held-out."""
+    from gdtool.diffusion.configure import chosen_configuration
     from gdtool.stages import early
 
-    configured(options)
+    chosen_configuration(options)
     if options.tensorboard:
         early.require_package(
             "torch.utils.tensorboard", "--tensorboard", "pip install 'gdtool[tensorboard]', or leave it out"
@@ -127,6 +125,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Train and write a model folder. Raises InputError for data or a configuration that does not fit."""
     import torch
 
+    from gdtool.diffusion.configure import chosen_configuration
     from gdtool.diffusion.data.objects import decode_dataset
     from gdtool.diffusion.data.sources import count_views_folders, views_folders
     from gdtool.diffusion.reports.record import Recorder, write_results
@@ -136,7 +135,7 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     from gdtool.diffusion.training.worker import Order, execute
 
     torch.set_num_threads(out.threads)
-    model_config, train_config = configured(options)
+    model_config, train_config = chosen_configuration(options)
     train_config, arithmetic = with_arithmetic(train_config, out.device)
     log.say(f"  training in {arithmetic.precision}: {arithmetic.reason}")
     with out.step("decode"):
@@ -177,22 +176,11 @@ def dismiss() -> None:
 
 def plan(options: Options, as_json: bool) -> str:
     """Predict what the training would cost, as text or as one JSON object."""
+    from gdtool.diffusion.configure import chosen_configuration
     from gdtool.diffusion.reports.plan import format_plan, make_plan
 
-    report = make_plan(*configured(options))
+    report = make_plan(*chosen_configuration(options))
     return msgspec.json.encode(report).decode() if as_json else format_plan(report)
-
-
-def configured(options: Options):
-    """Return the configurations: the preset, changed by the ablation, --config and the flags. Raises InputError."""
-    from gdtool.diffusion.configure import configuration
-
-    # Without --steps the minutes decide when the training ends.
-    steps = MOST_STEPS if options.minutes is not None and options.steps is None else options.steps
-    precision = None if options.precision == "auto" else options.precision
-    flags = {"steps": steps, "batch": options.batch, "precision": precision}
-    values = {name: value for name, value in flags.items() if value is not None}
-    return configuration(options.preset, options.part, options.ablation, options.config, values, options.size)
 
 
 STAGE = Stage(

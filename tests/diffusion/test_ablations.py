@@ -7,17 +7,18 @@ import torch
 from gdtool.core.errors import InputError
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ABLATIONS
+from gdtool.diffusion.configure import chosen_configuration
 from gdtool.diffusion.inference.sampling import SamplingOptions, sample_images
 from gdtool.diffusion.network.attention import Layout
 from gdtool.diffusion.network.model import Model
-from gdtool.stages.train import Options, configured
+from gdtool.stages.train import Options
 
 SMALL = {"channels": (8, 16), "head_width": 8, "encoder_width": 16, "image_size": 16, "row_attention": ()}
 COLOR, NORMAL, ROUGHNESS = (DOMAINS.index(d) for d in ("color", "normal", "roughness"))
 
 
 def model_of(name):
-    config, train = configured(Options(preset="tiny", ablation=name))
+    config, train = chosen_configuration(Options(preset="tiny", ablation=name))
     torch.manual_seed(0)
     model = Model(msgspec.structs.replace(config, **SMALL)).eval()
     for p in model.parameters():  # no weight at zero, so that every path has an effect
@@ -72,7 +73,9 @@ def test_each_ablation_samples_its_domains(name):
 
 def test_flags_and_a_file_change_an_ablation_further(tmp_path):
     (tmp_path / "c.json").write_text('{"model": {"multi_view": false}, "train": {"clip": 2.0}}')
-    model, train = configured(Options(preset="small", ablation="one_way", config=str(tmp_path / "c.json"), batch=3))
+    model, train = chosen_configuration(
+        Options(preset="small", ablation="one_way", config=str(tmp_path / "c.json"), batch=3)
+    )
     assert (model.cross_domain, model.multi_view, train.clip, train.batch) == ("one_way", False, 2.0, 3)
     with pytest.raises(InputError, match="does not exist"):
-        configured(Options(config="missing.json"))
+        chosen_configuration(Options(config="missing.json"))

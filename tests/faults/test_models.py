@@ -13,12 +13,13 @@ from gdtool.core.errors import InputError, ResourceError
 from gdtool.diffusion.checkpoint import wonder3d
 from gdtool.diffusion.checkpoint.weights import load_model, read_config, save_model
 from gdtool.diffusion.config import PRESETS
+from gdtool.diffusion.configure import chosen_configuration
 from gdtool.diffusion.inference.familiarity import read_ranges
 from gdtool.diffusion.network.grow import resize_config
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.network.tensors import read_tensors
 from gdtool.diffusion.training.loop import CHECKPOINT, load_checkpoint
-from gdtool.stages.train import Options, configured
+from gdtool.stages.train import Options
 from tests.faults.test_checkpoints import changed
 
 TINY = PRESETS["tiny"][0]
@@ -120,7 +121,7 @@ def test_every_preset_is_within_the_bounds(config):
 def test_train_refuses_invalid_changes_to_its_configuration(tmp_path, changes):
     (tmp_path / "changes.json").write_text(json.dumps(changes))
     with pytest.raises(InputError, match="changes.json"):
-        configured(Options(config=str(tmp_path / "changes.json")))
+        chosen_configuration(Options(config=str(tmp_path / "changes.json")))
 
 
 def test_an_image_size_that_the_network_cannot_have_is_refused():
