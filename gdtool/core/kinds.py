@@ -21,6 +21,8 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Report = Annotated[dict[str, Scalar], Meta(description="figures the stage measured, by name")]
 
 DOMAINS = ("color", "normal", "depth", "albedo", "roughness", "metallic")
+# Views of the default rig, around the object from the front; their azimuths are in cameras/camera.py.
+VIEW_NAMES = ("front", "front_right", "right", "back", "left", "front_left")
 Domain = Literal["color", "normal", "depth", "albedo", "roughness", "metallic", "closed_form"]
 
 IDENTITY: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Make six views of an object, in six domains, from one picture of it.
+"""Make six views of an object, in six domains, from one picture of it, or from several.
 
 The picture needs an alpha channel, --mask or --matting; without them the subject is cut out of a plain background, and
 guessed where the background is busy. The subject is cropped and centred as in training; use --no-crop for an
@@ -10,25 +10,47 @@ for which the outlines of the other views leave no room are added to those views
 picture's contrast where that is paint and not light. Metallic values are pushed to 0 or 1. A warning tells of
 a picture unlike those of the training, and of views that the model is unsure of.
 
-Example:
+Pictures of other sides, and views whose domains are known, are taken over as they are, and the rest is made to fit. The
+options are the views' names: --left is the camera at -X, to the left of the front one. Of a car that faces the front
+camera it sees the car's own right side.
+
+Examples:
   gdtool sample-views cat.png --seed 7
+  gdtool sample-views --front car.png --back behind.png --left left.png
+  gdtool render-dataset mesh.obj --domains normal,depth -o shape
+  gdtool sample-views photo.png --given shape
 """
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
-from gdtool.core.kinds import DOMAINS
-from gdtool.core.stage import FILE, MOST_SEED, Inputs, Output, SecondInput, Stage
-from gdtool.stages.sampling_options import Eta, Guidance, GuidedFrom, GuidedTo, Scheduler, Spacing, Steps
+from gdtool.core.errors import UsageError
+from gdtool.core.kinds import DOMAINS, VIEW_NAMES
+from gdtool.core.stage import FILE, Inputs, Output, SecondInput, Stage
+from gdtool.stages.sampling_options import (
+    Compile,
+    Eta,
+    Guidance,
+    GuidedFrom,
+    GuidedTo,
+    Mirror,
+    PictureOf,
+    Precision,
+    Scheduler,
+    Seed,
+    Spacing,
+    Steps,
+    ViewName,
+)
 
 if TYPE_CHECKING:
-    import numpy as np
-
+    from gdtool.diffusion.inference.conditions import Conditions
     from gdtool.folders.views import Views
 
 
@@ -42,16 +64,15 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     scheduler: Scheduler = "ddim"
     eta: Eta = None
     spacing: Spacing = "auto"
-    mirror: Annotated[
-        bool,
-        Meta(
-            description="Average with the views of the picture's mirror image, where the model's card says that it "
-            "gains from that; twice the time."
-        ),
-    ] = True
-    seed: Annotated[
-        int, Meta(ge=0, le=MOST_SEED, description="Seed of the noise, the same for every object whatever the order.")
-    ] = 0
+    mirror: Mirror = True
+    seed: Seed = 0
+    view: ViewName = "front"
+    front: PictureOf = None
+    front_right: PictureOf = None
+    right: PictureOf = None
+    back: PictureOf = None
+    left: PictureOf = None
+    front_left: PictureOf = None
     domains: Annotated[
         tuple[str, ...],
         Meta(description="Domains to write. They are what a run of all would write: those that they read are sampled."),
@@ -68,14 +89,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         ),
     ] = None
     crop: Annotated[bool, Meta(description="Centre the subject and scale it as in training.")] = True
-    precision: Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")] = "float32"
-    compile: Annotated[
-        bool,
-        Meta(
-            description="Compile the network first (torch.compile, needs a C++ compiler). It takes two minutes the "
-            "first time and ten seconds afterwards, and saves a third of each step."
-        ),
-    ] = False
+    precision: Precision = "float32"
+    compile: Compile = False
 
 
 def check(inputs: Inputs, options: Options) -> None:
@@ -91,6 +106,10 @@ def check(inputs: Inputs, options: Options) -> None:
             from gdtool.diffusion.data.condition import mask_size_error
 
             raise mask_size_error(options.mask, mask, image)
+    for view, path in other_pictures(options).items():
+        if view == options.view:
+            raise UsageError(f"--{view}", "is what the source shows", "give one of the two, or --view")
+        early.require_picture(f"--{view}", path)
     if options.matting is not None:
         early.require_file("--matting", options.matting)
         early.require_package("onnxruntime", "--matting", "pip install 'gdtool[matting]', or give a mask with --mask")
@@ -100,19 +119,11 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
     """Sample and write a views folder. Raises InputError for images and models that cannot be used."""
     import torch
 
-    from gdtool.cameras import rig
     from gdtool.diffusion.checkpoint import wonder3d
     from gdtool.diffusion.checkpoint.weights import load_model
-    from gdtool.diffusion.data.condition import PictureOptions, make_condition
-    from gdtool.diffusion.inference.pipeline import (
-        Subject,
-        choose_domains,
-        sample_subject,
-        sampling_options,
-        warn_of_doubts,
-    )
-    from gdtool.diffusion.inference.result import views_from_images
-    from gdtool.diffusion.network.encoding import BACKGROUND
+    from gdtool.diffusion.data.condition import PictureOptions
+    from gdtool.diffusion.inference.conditions import make_conditions
+    from gdtool.diffusion.inference.pipeline import choose_domains, sample_conditions, sampling_options
 
     torch.set_num_threads(out.threads)
     with out.step("load"):
@@ -121,50 +132,38 @@ def run(inputs: Inputs, options: Options, out: Output) -> None:
         model = (wonder3d.load if wonder3d.recognises(folder) else load_model)(folder).to(out.device)
     config = model.config
     domains = choose_domains(None if options.domains == DOMAINS else options.domains, config)
-    settings, of_wonder3d = sampling_options(options, domains), config.convention == "wonder3d"
-    used = asdict(settings.used_with(config))
+    settings = sampling_options(options, domains)
     with out.step("condition"):
-        framing = PictureOptions(options.mask, options.matting, options.crop, config.image_size, of_wonder3d)
-        condition, picture = make_condition(inputs.path, inputs.name, framing, out.warn)
+        framing = PictureOptions(
+            options.mask, options.matting, options.crop, config.image_size, config.convention == "wonder3d"
+        )
+        paths = {options.view: inputs.path, **{view: Path(path) for view, path in other_pictures(options).items()}}
+        conditions = make_conditions(model, paths, inputs.second_folder("given"), framing, out.warn)
     with out.step("sample"):
-        subject = Subject(inputs.name, condition)
-        images, silhouettes = sample_subject(model, folder, subject, settings, options.compile, out)
-    if of_wonder3d and "normal" in images:
-        images["normal"] = wonder3d.premultiplied_normals(images["normal"])
-    cameras = {camera.name: camera for camera in rig("wonder3d" if of_wonder3d else "six", config.image_size)}
-    views, report = views_from_images(
-        {d: x[0].cpu() for d, x in images.items()},
-        [cameras[name] for name in config.views],
-        BACKGROUND[config.backgrounds[0]],
-        domains,
-        condition[..., 3],
-        silhouettes,
-    )
-    warn_of_doubts(folder, report, config, settings, inputs.name, out)
+        views, report = sample_conditions(model, folder, conditions, settings, options.compile, inputs.name, out)
     with out.step("write"):
-        _write(views, report | used, condition, picture, domains, out)
+        _write(views, report | asdict(settings.used_with(config)), conditions, domains, out)
 
 
-def _write(
-    views: Views,
-    report: dict[str, Any],
-    condition: np.ndarray,
-    picture: np.ndarray,
-    domains: tuple[str, ...],
-    out: Output,
-) -> None:
+def other_pictures(options: Options) -> dict[str, str]:
+    """Return the paths of the pictures that options give, by view."""
+    return {name: path for name in VIEW_NAMES if (path := getattr(options, name)) is not None}
+
+
+def _write(views: Views, report: dict[str, Any], conditions: Conditions, domains: tuple[str, ...], out: Output) -> None:
     """Write the views folder, the condition image that the model saw, and the framed picture."""
     from gdtool.diffusion.data.condition import encode_rgba
     from gdtool.diffusion.inference.pipeline import tell_unused_picture
     from gdtool.folders.views import write_views
     from gdtool.images.io import write_png
 
-    write_png(out.path("condition/000.png"), encode_rgba(condition))
-    own_view = "front" if "front" in views.names else ""  # the view that the picture was taken from
+    write_png(out.path("condition/000.png"), encode_rgba(conditions.condition))
+    own_view = "front" if "front" in views.names and conditions.picture is not None else ""
     tell_unused_picture(report, domains, bool(own_view), out)
     if own_view:
-        write_png(out.path("picture.png"), encode_rgba(picture))
-    write_views(out, views, conditions=1, picture=own_view, report=report)
+        write_png(out.path("picture.png"), encode_rgba(conditions.picture))
+    matrix = conditions.given.source_from_world
+    write_views(out, views, source_from_world=matrix, conditions=1, picture=own_view, report=report)
 
 
 STAGE = Stage(
@@ -183,6 +182,12 @@ STAGE = Stage(
             default="models/default",
             foreign=True,
             help="Model folder of gdtool train, or Wonder3D v1 as a folder or hub id; the bundled model without it.",
-        )
+        ),
+        "given": SecondInput(
+            "views",
+            search=False,
+            help="Views of the default rig whose images are known, in whatever domains the folder has: the geometry of "
+            "a mesh, or another tool's color.",
+        ),
     },
 )

@@ -9,6 +9,8 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from gdtool.core.stage import FILE, MOST_SEED
+
 Steps = (
     Annotated[
         int, Meta(ge=1, le=1000, description="Denoising steps; without it the number that measured best for the model.")
@@ -52,5 +54,34 @@ Spacing = Annotated[
     Meta(
         description="Timesteps that the steps visit: from the last one (trailing), or down to the first (leading). "
         "auto: the model's own, trailing for gdtool's models and as its scheduler says for Wonder3D's."
+    ),
+]
+ViewName = Annotated[
+    Literal["front", "front_right", "right", "back", "left", "front_left"],
+    Meta(description="View that the source's picture shows."),
+]
+PictureOf = Annotated[str, Meta(description="Picture of the object from this view.", extra=FILE)] | None
+Mirror = Annotated[
+    bool,
+    Meta(
+        description="Average with the views of the picture's mirror image, where the model's card says that it "
+        "gains from that; twice the time."
+    ),
+]
+Seed = Annotated[
+    int,
+    Meta(
+        ge=0,
+        le=MOST_SEED,
+        description="Seed of the noise, the same for every object whatever the order. With a model that predicts "
+        "the shape first, 0 is its best guess, and other seeds give other shapes.",
+    ),
+]
+Precision = Annotated[Literal["float32", "bfloat16"], Meta(description="Arithmetic of the networks.")]
+Compile = Annotated[
+    bool,
+    Meta(
+        description="Compile the network first (torch.compile, needs a C++ compiler). It takes two minutes the "
+        "first time and ten seconds afterwards, and saves a third of each step."
     ),
 ]

@@ -56,3 +56,9 @@ def test_poses_are_rigid_also_from_above(position):
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3))
     assert np.isclose(np.linalg.det(pose[:3, :3]), 1)
     assert np.allclose(-pose[:3, 2], -np.array(position) / np.linalg.norm(position))
+
+
+def test_the_rigs_views_have_the_names_that_every_stage_knows():
+    from gdtool.core.kinds import VIEW_NAMES
+
+    assert tuple(name for name, _ in SIX_VIEWS) == VIEW_NAMES

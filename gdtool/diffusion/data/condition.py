@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,10 @@ class PictureOptions:
     size: int
     wonder3d: bool = False
 
+    def without_mask(self) -> PictureOptions:
+        """Return the same options for a picture that the mask does not belong to."""
+        return replace(self, mask=None)
+
 
 def mask_size_error(mask: str, size: tuple[int, ...], wanted: tuple[int, ...]) -> InputError:
     """Make the error for a mask whose size (width, height) is not the picture's."""
@@ -55,8 +59,15 @@ def make_condition(
 
     Returns two images of the same square: (size, size, 4) and (f size, f size, 4), float32, linear color and straight
     alpha. The whole number f, 1 to MAX_FINER, keeps the picture's resolution best. With options.wonder3d the sRGB
-    values of the first are whole multiples of 1/255. warn: called with a text where the subject may be cut off. Raises
-    InputError for a picture without a usable subject.
+    values of the first are whole multiples of 1/255. warn, errors: as in read_subject().
+    """
+    return _framed(read_subject(path, name, options, warn), options)
+
+
+def read_subject(path: Path, name: str, options: PictureOptions, warn: Callable[[str], None]) -> np.ndarray:
+    """Read a picture and cut its subject out; returns (h, w, 4), linear color and straight alpha, float32.
+
+    warn: called with a text where the subject may be cut off. Raises InputError for a picture without a usable subject.
     """
     image = read_image(path)
     if min(image.shape[:2]) < MIN_PICTURE_SIDE:
@@ -84,8 +95,7 @@ def make_condition(
     )
     if not linear:
         color = linear_from_srgb(color.astype(np.float32) / np.iinfo(image.dtype).max)
-    rgba = np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
-    return _framed(rgba, options)
+    return np.concatenate([color, alpha[..., None]], -1).astype(np.float32)
 
 
 def _framed(rgba: np.ndarray, options: PictureOptions) -> tuple[np.ndarray, np.ndarray]:
@@ -100,8 +110,18 @@ def _framed(rgba: np.ndarray, options: PictureOptions) -> tuple[np.ndarray, np.n
         condition = resample(rgba, square, size)
     else:
         condition = whole_frame(rgba, size)
-    finer = size * min(max(round(square.side / size), 1), MAX_FINER)
+    finer = finer_size(square, size)
     return condition, resample(rgba, square, finer) if options.crop else whole_frame(rgba, finer)
+
+
+def finer_size(square: Square, size: int) -> int:
+    """Return the whole multiple of size at which a square of a picture keeps about the picture's resolution."""
+    return size * min(max(round(square.side / size), 1), MAX_FINER)
+
+
+def frame_subject(rgba: np.ndarray, square: Square, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Resample a square of rgba (h, w, 4) to (size, size, 4), and to a multiple of it at the picture's resolution."""
+    return resample(rgba, square, size), resample(rgba, square, finer_size(square, size))
 
 
 def encode_rgba(image: np.ndarray) -> np.ndarray:

@@ -26,10 +26,49 @@ class Square:
 
 def framed_square(image: np.ndarray, extent: float = FRONT_EXTENT) -> Square:
     """Return the square around the subject of image (h, w, 4) whose side is 1 / extent times the subject's longest."""
-    rows, columns = np.nonzero(image[..., 3] > 0.5)
-    top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
-    side = float(max(bottom - top, right - left)) / extent
+    top, bottom, left, right = _bounding_box(image)
+    side = max(bottom - top, right - left) / extent
     return Square((left + right - side) / 2, (top + bottom - side) / 2, side)
+
+
+def framed_together(images: dict[str, np.ndarray]) -> dict[str, Square]:
+    """Return the squares of pictures (h, w, 4) by view that give all subjects one height, centred.
+
+    Orthographic views from around an object show it at the same height. The height and the widths of the views along
+    the axes are at most a unit box's; views at 45 degrees may be wider.
+    """
+    boxes = {view: _bounding_box(image) for view, image in images.items()}
+    ratios = [(right - left) / (bottom - top) for view, (top, bottom, left, right) in boxes.items() if "_" not in view]
+    longest = max([1.0, *ratios])  # in units of the common height
+    squares = {}
+    for view, (top, bottom, left, right) in boxes.items():
+        side = (bottom - top) * longest / FRONT_EXTENT
+        squares[view] = Square((left + right - side) / 2, (top + bottom - side) / 2, side)
+    return squares
+
+
+def square_onto(image: np.ndarray, mask: np.ndarray) -> Square:
+    """Return the square of image (h, w, 4) in which its subject lies on a silhouette, mask (size, size).
+
+    The bounding boxes have the same centre and the same longest side.
+    """
+    size = mask.shape[0]
+    top, bottom, left, right = _bounding_box(image)
+    to_top, to_bottom, to_left, to_right = _bounding_box(np.repeat(mask[..., None], 4, -1))
+    scale = max(bottom - top, right - left) / max(to_bottom - to_top, to_right - to_left)
+    return Square(
+        (left + right - scale * (to_left + to_right)) / 2,
+        (top + bottom - scale * (to_top + to_bottom)) / 2,
+        scale * size,
+    )
+
+
+def _bounding_box(image: np.ndarray) -> tuple[float, float, float, float]:
+    """Return top, bottom, left and right of the subject of image (h, w, 4); of the whole image where it has none."""
+    rows, columns = np.nonzero(image[..., 3] > 0.5)
+    if not len(rows):
+        return 0.0, float(image.shape[0]), 0.0, float(image.shape[1])
+    return float(rows.min()), float(rows.max() + 1), float(columns.min()), float(columns.max() + 1)
 
 
 def frame(image: np.ndarray, size: int, extent: float = FRONT_EXTENT) -> np.ndarray:

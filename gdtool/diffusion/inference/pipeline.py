@@ -9,16 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from gdtool.cameras import rig
 from gdtool.core.errors import UsageError
 from gdtool.core.stage import Output
+from gdtool.diffusion.checkpoint import wonder3d
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.data.objects import condition_batch
 from gdtool.diffusion.inference.compiled import sample_compiled
+from gdtool.diffusion.inference.conditions import Conditions
 from gdtool.diffusion.inference.familiarity import describe_doubts, describe_unfamiliar, read_ranges
+from gdtool.diffusion.inference.result import views_from_images
 from gdtool.diffusion.inference.sampling import SamplingOptions, averages_mirror_image, sample_images
 from gdtool.diffusion.inference.shape import make_guides
+from gdtool.diffusion.network.encoding import BACKGROUND
 from gdtool.diffusion.network.known import KnownImages
 from gdtool.diffusion.network.model import Model
+from gdtool.folders.views import Views
 
 
 def choose_domains(asked: tuple[str, ...] | None, config: ModelConfig) -> tuple[str, ...]:
@@ -64,12 +70,12 @@ class Subject:
 
 
 class Sampled(NamedTuple):
-    """Hold sampled views: images (1, k, 3, h, w) by domain, and the silhouettes (k, h, w) of the shape that they were
+    """Hold sampled views: images (1, k, 3, h, w) by domain, and the coverage (k, h, w) of the shape that they were
     painted on; None for a model without a shape network.
     """
 
     images: dict[str, torch.Tensor]
-    silhouettes: torch.Tensor | None
+    coverage: torch.Tensor | None
 
 
 def sample_subject(
@@ -97,6 +103,39 @@ def sample_subject(
     if options.used_with(model.config).guidance != 1 and (options.guided_from > 0 or options.guided_to < 1):
         out.skip("guidance of some steps", "they are outside --guided-from and --guided-to")
     return Sampled(images, None if guides is None else guides.mask[0].cpu())
+
+
+def sample_conditions(
+    model: Model,
+    folder: Path,
+    conditions: Conditions,
+    settings: SamplingOptions,
+    compiled: bool,
+    name: str,
+    out: Output,
+) -> tuple[Views, dict[str, Any]]:
+    """Sample all views of an object, and convert them to Views with the given images in their places.
+
+    folder: the model's. compiled: whether to compile the network first. name: the source's, in warnings. Returns the
+    views and a report (see result.views_from_images()), and warns where the model is unsure of them.
+    """
+    config, of_wonder3d = model.config, model.config.convention == "wonder3d"
+    subject = Subject(name, conditions.condition, conditions.given.known(config))
+    images, coverage = sample_subject(model, folder, subject, settings, compiled, out)
+    if of_wonder3d and "normal" in images:
+        images["normal"] = wonder3d.premultiplied_normals(images["normal"])
+    cameras = {camera.name: camera for camera in rig("wonder3d" if of_wonder3d else "six", config.image_size)}
+    views, report = views_from_images(
+        {d: x[0].cpu() for d, x in images.items()},
+        [cameras[name] for name in config.views],
+        BACKGROUND[config.backgrounds[0]],
+        settings.domains,
+        conditions.front_silhouette(),
+        coverage,
+    )
+    conditions.given.put_into(views)
+    warn_of_doubts(folder, report, config, settings, name, out)
+    return views, report
 
 
 def warn_of_doubts(
