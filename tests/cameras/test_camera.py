@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gdtool.cameras import camera_at, look_at, project, rays, rig
+from gdtool.cameras.camera import SIX_VIEWS
 
 
 def test_the_rig_stands_where_the_format_says():
