@@ -81,7 +81,7 @@ def _framed_by_depth(model: Model, path: Path, options: PictureOptions, warn: Ca
     for share in FRAMINGS:
         condition, picture = frame_subject(rgba, framed_square(rgba, share * FRONT_EXTENT), options.size)
         unit = torch.from_numpy(unit_picture(condition_plane(condition)))
-        if not _too_deep(predict_volume(model, unit, device=next(model.parameters()).device)):
+        if not _too_deep(predict_volume(model, unit)):
             break
     return Conditions(condition, picture, GivenImages())
 

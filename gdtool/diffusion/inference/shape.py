@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -19,44 +21,67 @@ LEAST_BEHIND = 0.75
 PRIOR_STEPS = 8  # denoising steps of a code: more do not change the spread of the shapes
 
 
-@torch.no_grad()
-def predict_volume(
-    model: Model,
-    rgba: torch.Tensor,
-    space: np.ndarray | None = None,
-    *,
-    seed: int | None = None,
-    device: torch.device | str = "cpu",
-) -> torch.Tensor:
-    """Predict the occupancy (1, r, r, r) of the object in a framed picture, in [0, 1], indexed (z, y, x).
+class ShapeInput(NamedTuple):
+    """Hold what the shape network is given of b objects.
+
+    channels (b, 5, r, r): the cropped pictures, as volumes.picture_channels() makes them. room (b, r, r, r): 1 where a
+    voxel may be occupied, else 0. pictured (b,): whether there is a picture from the front.
+    """
+
+    channels: torch.Tensor
+    room: torch.Tensor
+    pictured: torch.Tensor
+
+
+def network_input(rgba: torch.Tensor, space: np.ndarray | None = None) -> ShapeInput:
+    """Prepare one framed picture for the shape network.
 
     rgba (4, h, h): sRGB color times coverage, and coverage, in [0, 1]; coverage 0 everywhere says that there is no
     picture from the front. space (r, r, r) bool: voxels that may be occupied, besides what the picture's silhouette
-    says; None: all. seed: of the code, which chooses one of the possible shapes; None takes the network's best guess.
-    The silhouette from the front is exactly the picture's.
+    says; None: all.
     """
-    network = model.shape
-    assert network is not None
-    assert model.config.shape is not None
     picture = crop(rgba).numpy()
     allowed = np.ones((picture.shape[-1],) * 3, bool) if space is None else space.copy()
-    has_picture = bool((picture[3] > 0.5).any())
-    if has_picture:
+    pictured = bool((picture[3] > 0.5).any())
+    if pictured:
         allowed &= front_space(picture[3])
-    channels = torch.from_numpy(picture_channels(picture))[None].to(device)
-    room = torch.from_numpy(allowed)[None].float().to(device)
+    return ShapeInput(
+        torch.from_numpy(picture_channels(picture))[None],
+        torch.from_numpy(allowed)[None].float(),
+        torch.tensor([pictured]),
+    )
+
+
+@torch.no_grad()
+def predict_volumes(model: Model, given: ShapeInput, *, seed: int | None = None) -> torch.Tensor:
+    """Predict the occupancy (b, r, r, r) of objects, in [0, 1], indexed (z, y, x).
+
+    seed: of the code, which chooses one of the possible shapes; None takes the network's best guess. The silhouette
+    from the front is exactly the picture's.
+    """
+    network, config = model.shape, model.config.shape
+    assert network is not None
+    assert config is not None
+    device, count = next(network.parameters()).device, len(given.room)
+    channels, room, pictured = (x.to(device) for x in given)
     features = network.summarise(channels, room)
-    code, known = torch.zeros(1, model.config.shape.code, device=device), torch.zeros(1, device=device)
+    code, known = torch.zeros(count, config.code, device=device), torch.zeros(count, device=device)
     if seed is not None:
-        noise = torch.randn(code.shape, generator=torch.Generator().manual_seed(seed)).to(device)
-        code, known = network.prior.sample(features[-1].mean((2, 3)), noise, PRIOR_STEPS), known + 1
-    logits = network.expand(features, code, known)
+        noise = torch.randn(1, config.code, generator=torch.Generator().manual_seed(seed)).expand(count, -1)
+        code = network.prior.sample(features[-1].float().mean((2, 3)), noise.to(device), PRIOR_STEPS)
+        known = known + 1
+    logits = network.expand(features, code, known).float()
     occupancy = torch.sigmoid(logits) * room
-    if not has_picture:
-        return occupancy
     likeliest = torch.where(room > 0, logits, -torch.inf).argmax(1, keepdim=True)
-    behind = occupancy.gather(1, likeliest)
-    return occupancy.scatter(1, likeliest, torch.maximum(behind, LEAST_BEHIND * room.amax(1, keepdim=True)))
+    least = LEAST_BEHIND * room.amax(1, keepdim=True) * pictured[:, None, None, None]
+    return occupancy.scatter(1, likeliest, torch.maximum(occupancy.gather(1, likeliest), least))
+
+
+def predict_volume(
+    model: Model, rgba: torch.Tensor, space: np.ndarray | None = None, *, seed: int | None = None
+) -> torch.Tensor:
+    """Predict the occupancy (1, r, r, r) of the object in one picture; see network_input() and predict_volumes()."""
+    return predict_volumes(model, network_input(rgba, space), seed=seed)
 
 
 def known_space(known: KnownImages, i: int, model: Model) -> np.ndarray:
@@ -106,10 +131,10 @@ def make_guides(
             views = (mask[None], values["depth"][None], values["normal"][None])
         else:
             space = None if known is None else known_space(known, i, model)
-            volume = predict_volume(model, unit, space, seed=seed, device=device)
+            volume = predict_volume(model, unit, space, seed=seed)
             if mirror and seed is None:
                 flipped = None if space is None else space[..., ::-1].copy()
-                volume = (volume + predict_volume(model, unit.flip(-1), flipped, device=device).flip(-1)) / 2
+                volume = (volume + predict_volume(model, unit.flip(-1), flipped).flip(-1)) / 2
             views = tuple(render_volume(volume, config.views, config.image_size))
         guides.append(project_picture(unit[None].to(device), *views, config.views))
     return Guides(*(torch.cat(parts) for parts in zip(*guides, strict=True)))

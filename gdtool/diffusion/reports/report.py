@@ -77,7 +77,6 @@ def shape_validation(state, objects: Objects) -> tuple[np.ndarray, dict[str, flo
     one; side, of right and left alone; volume, of the voxels. Computed in float32.
     """
     model, config = state.model, state.model.config
-    device = next(model.parameters()).device
     rows, figures = [], []
     unseen = [k for k, name in enumerate(config.views) if name != "front"]
     side = [k for k, name in enumerate(config.views) if name in ("right", "left")]
@@ -85,7 +84,7 @@ def shape_validation(state, objects: Objects) -> tuple[np.ndarray, dict[str, flo
         volume = torch.from_numpy(unpack_volume(objects.volumes[i], config.image_size)).float()[None]
         rgba = unit_picture(from_bytes(objects.conditions[i, 0]).numpy())
         with averaged_weights(state):
-            guess = predict_volume(model, torch.from_numpy(rgba), device=device).cpu()
+            guess = predict_volume(model, torch.from_numpy(rgba)).cpu()
         truth, own = (render_volume(v, config.views, config.image_size).mask[0] for v in (volume, guess))
         figures.append(
             [

@@ -90,7 +90,7 @@ def view_losses(
     drop = dice[:, 2].to(device)
     embedding_off = drop < train.drop_embedding + train.drop_both
     latent_off = (drop >= train.drop_embedding) & (drop < train.drop_embedding + train.drop_both + train.drop_latent)
-    given = draw_given(model, batch, generators) if config.shape else None
+    given = draw_given(model, batch, generators, train.precision) if config.shape else None
     with precision_context(device, train.precision):
         context = model.encoder(rgba) * ~embedding_off[:, None, None]
         if given is None:

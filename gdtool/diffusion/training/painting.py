@@ -11,7 +11,8 @@ from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.config import ModelConfig
 from gdtool.diffusion.data.objects import Batch
 from gdtool.diffusion.data.volumes import silhouette_space, unit_picture
-from gdtool.diffusion.inference.shape import predict_volume
+from gdtool.diffusion.inference.sampling import precision_context
+from gdtool.diffusion.inference.shape import ShapeInput, network_input, predict_volumes
 from gdtool.diffusion.network.encoding import PLANES, decode, encode
 from gdtool.diffusion.network.known import KnownImages
 from gdtool.diffusion.network.model import Model
@@ -38,10 +39,10 @@ class Given(NamedTuple):
     trust: torch.Tensor
 
 
-def draw_given(model: Model, batch: Batch, generators: list[torch.Generator]) -> Given:
+def draw_given(model: Model, batch: Batch, generators: list[torch.Generator], precision: str) -> Given:
     """Draw guides and known images for a batch; its k views are all of the configuration's.
 
-    generators: one for each object.
+    generators: one for each object. precision: of the shape network, "float32" or "bfloat16".
     """
     config = model.config
     assert batch.occupancy is not None
@@ -49,22 +50,31 @@ def draw_given(model: Model, batch: Batch, generators: list[torch.Generator]) ->
     indices = tuple(DOMAINS.index(d) for d in config.domains)
     images = encode(batch.planes, indices, torch.zeros(len(mask), device=mask.device))
     geometry = decode({d: images[:, indices.index(DOMAINS.index(d))] for d in ("depth", "normal")}, mask, 0.0)
-    pieces, given = [], torch.zeros(images.shape[:3], device=mask.device)
+    given = torch.zeros(images.shape[:3], device=mask.device)
+    pictures, inputs, sources = [], [], torch.zeros(len(mask))
     for i, generator in enumerate(generators):
         dice = torch.rand(4, generator=generator).tolist()
         given[i] = draw_known(config, dice, generator)
-        rgba = torch.from_numpy(unit_picture(batch.condition[i].cpu().numpy())).to(mask.device)
-        if dice[0] < PREDICTED_SHARE + VOXEL_SHARE:
-            volume = batch.occupancy[i : i + 1].float()
-            if dice[0] < PREDICTED_SHARE:
-                space = _known_space(batch.occupancy[i].cpu().numpy() > 0, given[i], config)
-                volume = predict_volume(model, rgba.cpu(), space, device=mask.device)
-            pieces.append((rgba, *(x[0] for x in render_volume(volume, config.views, config.image_size))))
-        else:
-            pieces.append((rgba, mask[i], geometry["depth"][i], geometry["normal"][i]))
-    rgba, guide_mask, depth, normal = (torch.stack(column) for column in zip(*pieces, strict=True))
-    guides = project_picture(rgba, guide_mask, depth, normal, config.views)
-    return Given(guides, KnownImages(images, given, mask), 1 - (guide_mask - mask).abs())
+        pictures.append(torch.from_numpy(unit_picture(batch.condition[i].cpu().numpy())))
+        sources[i] = dice[0]
+        if dice[0] < PREDICTED_SHARE:
+            inputs.append(
+                network_input(pictures[i], _known_space(batch.occupancy[i].cpu().numpy() > 0, given[i], config))
+            )
+    rgba = torch.stack(pictures).to(mask.device)
+    volumes = batch.occupancy.float()
+    if inputs:
+        with precision_context(mask.device, precision):
+            predicted = predict_volumes(model, ShapeInput(*(torch.cat(parts) for parts in zip(*inputs, strict=True))))
+        volumes[sources < PREDICTED_SHARE] = predicted
+    rendered = [mask.clone(), geometry["depth"].clone(), geometry["normal"].clone()]
+    from_volume = torch.nonzero(sources < PREDICTED_SHARE + VOXEL_SHARE).flatten()
+    if len(from_volume):
+        views = render_volume(volumes[from_volume], config.views, config.image_size)
+        for whole, part in zip(rendered, views, strict=True):
+            whole[from_volume] = part
+    guides = project_picture(rgba, *rendered, config.views)
+    return Given(guides, KnownImages(images, given, mask), 1 - (guides.mask - mask).abs())
 
 
 def draw_known(config: ModelConfig, dice: list[float], generator: torch.Generator) -> torch.Tensor:
