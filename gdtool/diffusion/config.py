@@ -371,9 +371,10 @@ SHAPE_TRAINING = TrainConfig(
     part="shape",
     batch=16,
     steps=20_000,
-    phases=(Phase(learning_rate=6e-4),),
+    phases=(Phase(learning_rate=8e-4),),
     optimizer="muon",
-    warmup=200,
+    clip=100.0,  # both optimisers take the gradient's direction alone; its length is some tens
+    warmup=100,
     betas=(0.9, 0.99),
     weight_decay=0.02,
     tilted=0.4,
