@@ -160,7 +160,7 @@ def _write(views: Views, report: dict[str, Any], conditions: Conditions, domains
     write_png(out.path("condition/000.png"), encode_rgba(conditions.condition))
     own_view = "front" if "front" in views.names and conditions.picture is not None else ""
     tell_unused_picture(report, domains, bool(own_view), out)
-    if own_view:
+    if own_view and conditions.picture is not None:
         write_png(out.path("picture.png"), encode_rgba(conditions.picture))
     matrix = conditions.given.source_from_world
     write_views(out, views, source_from_world=matrix, conditions=1, picture=own_view, report=report)

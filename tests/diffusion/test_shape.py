@@ -15,6 +15,7 @@ from gdtool.diffusion.inference.shape import make_guides, no_images, predict_vol
 from gdtool.diffusion.network.encoding import encode, planes_from_images
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.shape.guides import base_images, mirror_guides, project_picture
+from gdtool.diffusion.shape.render import Rendered
 from gdtool.diffusion.shape.volume import crop
 from gdtool.diffusion.training.loop import RunOptions, new_state, run_training, train_step
 from tests.diffusion.spheres import LIGHT, sphere_views
@@ -75,7 +76,7 @@ def true_guides():
     rgba = sphere_picture()[None]
     normal = torch.from_numpy(np.moveaxis(views.images["normal"], -1, 1))[None]
     mask, depth = (torch.from_numpy(x)[None] for x in (views.mask, views.images["depth"]))
-    return project_picture(rgba, mask, depth, normal, MODEL.views), views
+    return project_picture(rgba, Rendered(mask, depth, normal), MODEL.views), views
 
 
 def test_the_front_silhouette_of_a_predicted_volume_is_the_pictures():

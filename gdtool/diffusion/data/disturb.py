@@ -23,8 +23,10 @@ def disturb_picture(rgba: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return rgba
     cv2 = imported("cv2")
     coverage = rgba[3]
-    color = np.ascontiguousarray(np.moveaxis(rgba[:3], 0, -1) / np.maximum(coverage, 1e-3)[..., None], np.float32)
-    gain = 2.0 ** (rng.normal(0, EXPOSURE) + rng.normal(0, BALANCE, 3))
+    color: np.ndarray = np.ascontiguousarray(
+        np.moveaxis(rgba[:3], 0, -1) / np.maximum(coverage, 1e-3)[..., None], np.float32
+    )
+    gain: np.ndarray = 2.0 ** (rng.normal(0, EXPOSURE) + rng.normal(0, BALANCE, 3))
     color = np.clip(color.clip(0, 1) ** np.exp(rng.normal(0, GAMMA)) * gain ** (1 / 2.2), 0, 1)
     if rng.random() < GREY_SHARE:
         color = np.repeat(color.mean(-1, keepdims=True), 3, -1)

@@ -214,8 +214,8 @@ class Batch:
 
     def to(self, device: str) -> Batch:
         """Move all tensors to a device."""
-        parts = (self.planes, self.condition, self.lights, self.occupancy)
-        return Batch(*(None if x is None else x.to(device) for x in parts))
+        occupancy = None if self.occupancy is None else self.occupancy.to(device)
+        return Batch(self.planes.to(device), self.condition.to(device), self.lights.to(device), occupancy)
 
 
 def object_order(count: int, step: int, batch: int, seed: int) -> np.ndarray:

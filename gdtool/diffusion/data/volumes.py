@@ -128,6 +128,7 @@ def draw_shape_batch(
 
 def _draw_object(objects: Objects, i: int, config: ModelConfig, train: TrainConfig, rng: np.random.Generator):
     """Draw one object: its picture's channels, the space around it, its volume, and whether its code is told."""
+    assert objects.volumes is not None
     occupancy = unpack_volume(objects.volumes[i], config.image_size)
     tilted = rng.random() < train.tilted and objects.conditions.shape[1] > 1
     pick = int(rng.integers(1, objects.conditions.shape[1])) if tilted else 0

@@ -12,7 +12,7 @@ from gdtool.diffusion.network.encoding import decode
 from gdtool.diffusion.network.known import KnownImages
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.shape.guides import Guides, project_picture
-from gdtool.diffusion.shape.render import render_volume
+from gdtool.diffusion.shape.render import Rendered, render_volume
 from gdtool.diffusion.shape.volume import carve, crop, volume_side
 
 # Occupancy that is given to the likeliest voxel behind a pixel of the picture's silhouette where no voxel is occupied:
@@ -128,15 +128,15 @@ def make_guides(
             mask = known.mask[i]
             rows = {d: config.domains.index(d) for d in ("depth", "normal")}
             values = decode({d: known.images[i, row] for d, row in rows.items()}, mask, 0.0)
-            views = (mask[None], values["depth"][None], values["normal"][None])
+            views = Rendered(mask[None], values["depth"][None], values["normal"][None])
         else:
             space = None if known is None else known_space(known, i, model)
             volume = predict_volume(model, unit, space, seed=seed)
             if mirror and seed is None:
                 flipped = None if space is None else space[..., ::-1].copy()
                 volume = (volume + predict_volume(model, unit.flip(-1), flipped).flip(-1)) / 2
-            views = tuple(render_volume(volume, config.views, config.image_size))
-        guides.append(project_picture(unit[None].to(device), *views, config.views))
+            views = render_volume(volume, config.views, config.image_size)
+        guides.append(project_picture(unit[None].to(device), views, config.views))
     return Guides(*(torch.cat(parts) for parts in zip(*guides, strict=True)))
 
 

@@ -31,7 +31,7 @@ class Condition(NamedTuple):
     inputs: torch.Tensor
     base: torch.Tensor | None = None
 
-    def __mul__(self, factor: torch.Tensor) -> Condition:
+    def scaled(self, factor: torch.Tensor) -> Condition:
         """Multiply the inputs by a factor that broadcasts against them; 0 drops the condition."""
         return Condition(self.inputs * factor, self.base)
 

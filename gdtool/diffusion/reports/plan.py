@@ -307,10 +307,9 @@ def data_bytes(config: ModelConfig, domains: int, views: int) -> float:
 
 def make_plan(config: ModelConfig, train: TrainConfig) -> dict:
     """Build the report of `gdtool train --plan`: weights, and for each phase FLOPs, memory and seconds of a step."""
-    network = structure(config)
-    if train.part == "shape":
-        network = network.shape
-    weights = parameter_count(network)
+    model = structure(config)
+    trained = model.shape if train.part == "shape" and model.shape is not None else model
+    weights = parameter_count(trained)
     frozen = frozen_cost(config)
     processor = choose_arithmetic("cpu")
     report: dict = {

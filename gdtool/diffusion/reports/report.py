@@ -77,6 +77,7 @@ def shape_validation(state, objects: Objects) -> tuple[np.ndarray, dict[str, flo
     one; side, of right and left alone; volume, of the voxels. Computed in float32.
     """
     model, config = state.model, state.model.config
+    assert objects.volumes is not None
     rows, figures = [], []
     unseen = [k for k, name in enumerate(config.views) if name != "front"]
     side = [k for k, name in enumerate(config.views) if name in ("right", "left")]

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from gdtool.cameras.camera import DISTANCE, HALF_WIDTH
 from gdtool.core.kinds import DOMAINS
 from gdtool.diffusion.network.encoding import SLAB, mirrored_order
+from gdtool.diffusion.shape.render import Rendered
 from gdtool.diffusion.shape.volume import world_axes
 
 GUIDE_CHANNELS = 9  # coverage, depth, normal (3), projected color (3), visibility
@@ -36,15 +37,13 @@ class Guides(NamedTuple):
     visible: torch.Tensor
 
 
-def project_picture(
-    rgba: torch.Tensor, mask: torch.Tensor, depth: torch.Tensor, normal: torch.Tensor, views: tuple[str, ...]
-) -> Guides:
+def project_picture(rgba: torch.Tensor, rendered: Rendered, views: tuple[str, ...]) -> Guides:
     """Project a picture along the front view's axis onto the surfaces of all views.
 
-    rgba (b, 4, h, h): sRGB color times coverage, and coverage, in [0, 1]. mask, depth, normal: as in Guides. views: the
-    names of the k views, one of them "front". Points that the picture does not show take the color of what lies before
-    them.
+    rgba (b, 4, h, h): sRGB color times coverage, and coverage, in [0, 1]. rendered: of the shape. views: the names of
+    the k views, one of them "front". Points that the picture does not show take the color of what lies before them.
     """
+    mask, depth, normal = rendered
     size, front = rgba.shape[-1], views.index("front")
     columns = ((torch.arange(size, device=rgba.device) + 0.5) / size * 2 - 1).expand(size, size)
     rows = columns.T

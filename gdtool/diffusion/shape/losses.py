@@ -38,5 +38,5 @@ def shape_errors(
         "voxels": VOXEL_WEIGHT * voxels,
         "front": FRONT_WEIGHT * error(logits.amax(1), occupancy.amax(1)),
         "side": error(logits.amax(3), occupancy.amax(3)),
-        "diagonal": sum(diagonal) / len(diagonal),
+        "diagonal": torch.stack(diagonal).mean(),
     }

@@ -24,8 +24,8 @@ class SelfAttention(nn.Module):
         super().__init__()
         self.norm = nn.GroupNorm(config.norm_groups, width)
         self.attention = Attention(width, max(width // config.head_width, 1))
-        nn.init.zeros_(self.attention.to_out[0].weight)
-        nn.init.zeros_(self.attention.to_out[0].bias)
+        for p in self.attention.to_out.parameters():
+            nn.init.zeros_(p)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Map features (b, c, h, w) to features of the same shape."""
@@ -86,6 +86,7 @@ class ShapeNetwork(nn.Module):
         self.norm_out = nn.GroupNorm(config.norm_groups, widths[0])
         self.write = nn.Conv2d(widths[0], side * FOLD**2, 3, padding=1)
         nn.init.normal_(self.write.weight, std=0.01)
+        assert self.write.bias is not None
         nn.init.constant_(self.write.bias, EMPTY_BIAS)
         self.code = ShapeCode(config.code, side)
         self.prior = LatentPrior(config.code, widths[last], config.prior_width)

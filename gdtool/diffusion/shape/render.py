@@ -68,7 +68,8 @@ def _gradient(occupancy: torch.Tensor) -> torch.Tensor:
     for axis in (1, 2, 3):  # a sum of shifted copies: three times as fast as a convolution with one channel
         padding = [0, 0] * (3 - axis) + [BLUR_RADIUS, BLUR_RADIUS]
         padded = F.pad(blurred, padding)
-        blurred = sum(float(tap) * padded.narrow(axis, i, side) for i, tap in enumerate(taps / taps.sum()))
+        shifted = [float(tap) * padded.narrow(axis, i, side) for i, tap in enumerate(taps / taps.sum())]
+        blurred = torch.stack(shifted).sum(0)
     z, y, x = torch.gradient(blurred, dim=(1, 2, 3))
     return torch.stack([-x, y, -z], 1)  # rows grow downward, the world's y upward
 

@@ -98,7 +98,9 @@ def view_losses(
         else:
             condition = model.condition_latents(rgba, layout, step.views, given.guides, given.known)
         kept = ~latent_off.repeat_interleave(len(condition.inputs) // b)
-        predicted = model.predict_clean(noisy, condition * kept[:, None, None, None], t, context, layout, step.views)
+        predicted = model.predict_clean(
+            noisy, condition.scaled(kept[:, None, None, None]), t, context, layout, step.views
+        )
 
     trust = None if given is None else trusted(given, step)
     weighted, square = image_error(predicted, clean, b, step.domains, config, train, trust)  # (b, d) each

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from gdtool.core.errors import UsageError
@@ -62,7 +64,7 @@ class MuonAndAdam:
         self.dtype = torch.bfloat16 if train.precision == "bfloat16" else torch.float32
         self.momentum: dict[torch.Tensor, torch.Tensor] = {}
         self.matrices = matrices
-        self.group = {"params": matrices, "lr": 1.0, "weight_decay": train.weight_decay, "rate": 1.0}
+        self.group: dict[str, Any] = {"params": matrices, "lr": 1.0, "weight_decay": train.weight_decay, "rate": 1.0}
         self.adam = torch.optim.AdamW(rest, lr=1.0, betas=train.betas, fused=True)
         self.param_groups = [self.group, *self.adam.param_groups]
 
@@ -88,6 +90,7 @@ class MuonAndAdam:
     @torch.no_grad()
     def _step_matrix(self, p: torch.Tensor) -> None:
         """Move one matrix along its orthogonalised Nesterov momentum."""
+        assert p.grad is not None
         gradient, rate = p.grad.reshape(p.shape[0], -1), self.group["lr"]
         moment = self.momentum.setdefault(p, torch.zeros_like(gradient))
         moment.lerp_(gradient, 1 - MOMENTUM)

@@ -17,7 +17,7 @@ from gdtool.diffusion.network.encoding import PLANES, decode, encode
 from gdtool.diffusion.network.known import KnownImages
 from gdtool.diffusion.network.model import Model
 from gdtool.diffusion.shape.guides import Guides, project_picture
-from gdtool.diffusion.shape.render import render_volume
+from gdtool.diffusion.shape.render import Rendered, render_volume
 
 # Shares of objects by where their guides come from. The rest has exact geometry, with normals and depth known, as when
 # a mesh is given to be textured.
@@ -67,13 +67,13 @@ def draw_given(model: Model, batch: Batch, generators: list[torch.Generator], pr
         with precision_context(mask.device, precision):
             predicted = predict_volumes(model, ShapeInput(*(torch.cat(parts) for parts in zip(*inputs, strict=True))))
         volumes[sources < PREDICTED_SHARE] = predicted
-    rendered = [mask.clone(), geometry["depth"].clone(), geometry["normal"].clone()]
+    rendered = Rendered(mask.clone(), geometry["depth"].clone(), geometry["normal"].clone())
     from_volume = torch.nonzero(sources < PREDICTED_SHARE + VOXEL_SHARE).flatten()
     if len(from_volume):
         views = render_volume(volumes[from_volume], config.views, config.image_size)
         for whole, part in zip(rendered, views, strict=True):
             whole[from_volume] = part
-    guides = project_picture(rgba, *rendered, config.views)
+    guides = project_picture(rgba, rendered, config.views)
     return Given(guides, KnownImages(images, given, mask), 1 - (guides.mask - mask).abs())
 
 

@@ -48,4 +48,4 @@ def errors_of_volumes(
         logits = network.expand(features, code + CODE_NOISE * noise[:, 0], batch.known)
     parts = shape_errors(logits.float(), batch.occupancy, batch.space, first_row, model.config.image_size)
     parts["prior"] = network.prior.loss(code, features[-1].float().mean((2, 3)), angle, noise[:, 1])
-    return {"loss": sum(parts.values()), **{name: value.detach() for name, value in parts.items()}}
+    return {"loss": torch.stack(list(parts.values())).sum(), **{name: value.detach() for name, value in parts.items()}}
