@@ -29,7 +29,8 @@ import torch
 from scipy.stats import rankdata, spearmanr
 
 from benchmarks.sample_views.sheets import photograph
-from benchmarks.train.quality import DEFAULT_MODEL, figures, true_views, views_folders
+from benchmarks.train.figures import figures
+from benchmarks.train.held_out import DEFAULT_MODEL, true_views, views_folders
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, encode, list_files
