@@ -84,5 +84,7 @@ def load_lpips(network: str) -> Lpips:
 
     lpips = Lpips(network)
     lpips.load_state_dict(load_file(weights_file(network)))
-    # Channels last in memory: a fifth less time on a processor.
-    return lpips.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+    for weight in lpips.parameters():  # channels last in memory: a fifth less time on a processor
+        if weight.ndim == 4:
+            weight.data = weight.data.contiguous(memory_format=torch.channels_last)
+    return lpips.eval().requires_grad_(False)

@@ -49,6 +49,9 @@ ARCHITECTURES = {
 class Features(nn.Module):
     """Compute the features of a classifier at its taps, from pictures (n, 3, h, w) in [-1, 1]."""
 
+    shift: torch.Tensor
+    scale: torch.Tensor
+
     def __init__(self, name: str, layers: tuple[Layer, ...] | None = None):
         super().__init__()
         self.layers = layers or ARCHITECTURES[name]
