@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common.measure import say
+from benchmarks.train.authored import is_authored
 from benchmarks.train.figures import SHOWN
 from benchmarks.train.inflate import Picture
 from gdtool.cameras import Camera
@@ -21,6 +22,7 @@ PICTURE_SIZE = 64  # pixels: side of the pictures among which the nearest is loo
 GREY = 0.5  # behind them, sRGB
 _BINS = 1000  # of the histograms that medians are taken from
 _COLORS, _SCALARS = ("color", "albedo"), ("roughness", "metallic")
+_UNKNOWN = {"roughness": 0.5, "metallic": 0.0}  # where no training object has an authored one
 _DEPTH_RANGE = (1.0, 3.0)  # world units: near and far of the rig's cameras
 
 
@@ -29,8 +31,8 @@ class TrainingObjects:
     """Hold what the baselines need of n training objects.
 
     folders: of their views. pictures (n, 64, 64, 4) uint8: their front views. mean: the mean object's views; its color
-    is the mean over white. color, albedo (3,): mean sRGB of the foreground. roughness, metallic, depth: medians of the
-    foreground.
+    is the mean over white. color, albedo (3,): mean sRGB of the foreground. depth: median of the foreground. roughness,
+    metallic: medians of the foreground of those objects where they are authored, 0.5 and 0 where none is.
     """
 
     folders: tuple[str, ...]
@@ -76,7 +78,7 @@ def read_training_objects(folders: list[Folder], cache: Path) -> TrainingObjects
     if not file.exists():
         sums = _Sums()
         for count, folder in enumerate(folders):
-            sums.add(read_views(folder))
+            sums.add(read_views(folder), is_authored(folder))
             if count % 500 == 0:
                 say(f"  read {count} of {len(folders)} training objects")
         cache.mkdir(parents=True, exist_ok=True)
@@ -101,8 +103,8 @@ class _Sums:
         self.pixels = 0
         self.histograms = {domain: np.zeros(_BINS) for domain in (*_SCALARS, "depth")}
 
-    def add(self, views: Views) -> None:
-        """Add one object."""
+    def add(self, views: Views, authored: bool) -> None:
+        """Add one object. authored: whether its roughness and metallic count for the medians."""
         front, full = views.names.index(SHOWN), views.mask > FULL
         self.pictures.append(_small(views.images["color"][front], views.mask[front]))
         self.count, self.mask = self.count + 1, views.mask.astype(np.float64) + (self.mask if self.count else 0)
@@ -113,7 +115,7 @@ class _Sums:
             self.images[domain] = value * weight + self.images.get(domain, 0)
             if domain in _COLORS:
                 self.colors[domain] += value[full].sum(0)
-            elif domain in self.histograms:
+            elif domain == "depth" or (domain in _SCALARS and authored):
                 limits = _DEPTH_RANGE if domain == "depth" else (0.0, 1.0)
                 self.histograms[domain] += np.histogram(np.clip(value[full], *limits), _BINS, limits)[0]
 
@@ -132,7 +134,8 @@ class _Sums:
         for domain, histogram in self.histograms.items():
             low, high = _DEPTH_RANGE if domain == "depth" else (0.0, 1.0)
             middle = np.searchsorted(np.cumsum(histogram), histogram.sum() / 2) + 0.5
-            out[domain] = np.array(low + (high - low) * middle / _BINS)
+            median = low + (high - low) * middle / _BINS
+            out[domain] = np.array(median if histogram.any() else _UNKNOWN[domain])
         return out
 
 

@@ -150,8 +150,7 @@ class BaselineMaker:
     def views(self, held: Held, truth: Views) -> Views:
         picture = picture_of(truth)
         if self.kind == "inflated":
-            scalars = (self.training.roughness, self.training.metallic) if self.training else ()
-            return inflated_views(picture, truth.cameras, *scalars)
+            return inflated_views(picture, truth.cameras)
         assert self.training is not None
         if self.kind == "nearest":
             return of_size(self.training.nearest(picture), truth)
@@ -172,16 +171,16 @@ def of_size(views: Views, truth: Views) -> Views:
 
 def baselines(folders: list[Folder], work: Path) -> list[BaselineMaker]:
     """Return the baselines; without training objects only the inflated silhouette."""
-    if not folders:
-        return [BaselineMaker("inflated silhouette", "inflated", f"inflated-{_VERSION}")]
-    training, digest = read_training_objects(folders, work), digest_of(folders)
-    names = {
-        "inflated": "inflated silhouette",
-        "nearest": "nearest training object",
-        "constants": "constants",
-        "mean": "mean training object",
-    }
-    return [BaselineMaker(name, kind, f"{kind}-{_VERSION}-{digest}", training) for kind, name in names.items()]
+    made = [BaselineMaker("inflated silhouette", "inflated", f"inflated-{_VERSION}")]
+    if folders:
+        training, digest = read_training_objects(folders, work), digest_of(folders)
+        names = {
+            "nearest": "nearest training object",
+            "constants": "constants",
+            "mean": "mean training object",
+        }
+        made += [BaselineMaker(name, kind, f"{kind}-{_VERSION}-{digest}", training) for kind, name in names.items()]
+    return made
 
 
 def model_maker(text: str, work: Path) -> ModelMaker:

@@ -37,37 +37,16 @@ import numpy as np
 
 from benchmarks.common.measure import Failed, say
 from benchmarks.common.resumable_rows import KeyedRows
+from benchmarks.train.authored import is_authored
 from benchmarks.train.figures import PerceptualTruth, figures, on_shared_pixels
 from benchmarks.train.held_out import DEFAULT_MODEL, object_name, views_folders
 from benchmarks.train.makers import Held, Maker, ModelMaker, baselines, model_maker
 from benchmarks.train.quality_report import write_report
 from benchmarks.train.split import read_split
-from benchmarks.train.surfaces import spread, surface_row
+from benchmarks.train.surfaces import chosen, surface_row
 from gdtool.core.folder import Folder
-from gdtool.evaluation.references import find_truth
-from gdtool.folders.models import load_model
-from gdtool.geometry.meshes import TriMesh
-from gdtool.geometry.normals import face_normals
 
-AUTHORED_AREA = 0.5  # share of the area with a metallic-roughness texture from which both count as authored
 _VERSION = "1"  # of the figures: raise it when they change
-
-
-def is_authored(folder: Folder) -> bool:
-    """Tell whether roughness and metallic of an object are somebody's measurement or choice, and not a constant.
-
-    So they are where the source has a metallic-roughness texture on at least half of its area, and where the generator
-    made it. Factors do not count: in most files they are an exporter's, one pair for a whole pack.
-    """
-    source = find_truth(folder)
-    if isinstance(source, str) and source.startswith("procedural:"):
-        return True
-    if source is None:
-        return False
-    scene = load_model(source)
-    area = face_normals(TriMesh(scene.vertices, scene.faces))[1]
-    textured = np.array([material.metallic_roughness_texture is not None for material in scene.materials])
-    return float(area[textured[scene.face_materials]].sum()) >= AUTHORED_AREA * float(area.sum())
 
 
 @dataclass
@@ -195,7 +174,7 @@ def main() -> None:
             bench.measure(held)
             if number % 10 == 9:
                 say(f"  {name}: {number + 1} of {len(objects)}")
-        bench.measure_surfaces(spread(objects, arguments.surfaces))
+        bench.measure_surfaces(chosen(objects, arguments.surfaces))
         sets[name] = objects
     tables = {name: objects for name, objects in sets.items() if objects}
     for name, objects in sets.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from pathlib import Path
 
@@ -13,10 +14,9 @@ from gdtool.assets.gltf.write import write_glb
 KEYS = ("surface_distance", "surface_f_score", "surface_iou", "surface_normal_degrees")
 
 
-def spread(objects: list[Held], count: int) -> list[Held]:
-    """Choose `count` objects, evenly spread over the list."""
-    count = min(count, len(objects))
-    return [objects[i * len(objects) // count] for i in range(count)]
+def chosen(objects: list[Held], count: int) -> list[Held]:
+    """Choose `count` objects by their names' hashes: a larger number keeps those of a smaller one."""
+    return sorted(objects, key=lambda held: hashlib.sha1(held.name.encode()).hexdigest())[:count]
 
 
 def surface_row(maker: Maker, held: Held) -> dict | None:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from benchmarks.common.resumable_rows import KeyedRows
-from benchmarks.train import quality
+from benchmarks.train import authored, quality
 from benchmarks.train.baselines import read_training_objects
 from benchmarks.train.corpus import unpacked
 from benchmarks.train.figures import figures, on_shared_pixels
 from benchmarks.train.inflate import Picture, distance_to_outline, inflated_views
 from benchmarks.train.makers import Held, model_maker, of_size, picture_of
 from benchmarks.train.quality_report import mean_and_error, summary, write_report
-from benchmarks.train.surfaces import spread
+from benchmarks.train.surfaces import chosen
 from gdtool.assets.scene import Material, Scene, Texture
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
@@ -118,8 +118,9 @@ def test_shared_pixels_are_those_of_all_results():
 
 
 @pytest.fixture
-def training(tmp_path):
+def training(tmp_path, monkeypatch):
     """Two training objects: a small rough blue ball and a large smooth red one."""
+    monkeypatch.setattr("benchmarks.train.baselines.is_authored", lambda folder: True)
     folders = [
         write_ball(tmp_path / "a.asset" / "views", radius=12, roughness=0.8),
         write_ball(tmp_path / "b.asset" / "views", radius=22, color=(0.8, 0.1, 0.1), roughness=0.2),
@@ -136,6 +137,13 @@ def test_constants_are_medians_and_means_of_the_foreground(training):
     # The red ball has three times the pixels: its roughness is the median.
     assert training[0].roughness == pytest.approx(0.2, abs=0.01)
     assert training[0].color[0] > 0.7
+
+
+def test_medians_are_those_of_authored_objects(training, tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.train.baselines.is_authored", lambda folder: folder == training[1][0])
+    assert read_training_objects(training[1], tmp_path / "only small").roughness == pytest.approx(0.8, abs=0.01)
+    monkeypatch.setattr("benchmarks.train.baselines.is_authored", lambda folder: False)
+    assert read_training_objects(training[1], tmp_path / "none").roughness == 0.5
 
 
 def test_constant_views_have_the_pictures_silhouette_and_face_the_camera(training):
@@ -239,8 +247,8 @@ def test_a_mean_has_its_standard_error():
     assert np.isnan(mean_and_error([1])[1])
 
 
-@pytest.mark.parametrize(("share", "authored"), [(0.6, True), (0.4, False)])
-def test_authored_needs_a_texture_on_half_of_the_area(share, authored, monkeypatch):
+@pytest.mark.parametrize(("share", "expected"), [(0.6, True), (0.4, False)])
+def test_authored_needs_a_texture_on_half_of_the_area(share, expected, monkeypatch):
     vertices = np.array([[0, 0, 0], [share, 0, 0], [0, 1, 0], [0, 0, 1], [1 - share, 0, 1], [0, 1, 1]], float)
     texture = Texture(np.zeros((2, 2, 3), np.uint8))
     scene = Scene(
@@ -249,14 +257,14 @@ def test_authored_needs_a_texture_on_half_of_the_area(share, authored, monkeypat
         (Material(metallic_roughness_texture=texture), Material(roughness=0.3)),
         np.array([0, 1], np.int32),
     )
-    monkeypatch.setattr(quality, "find_truth", lambda folder: "model.glb")
-    monkeypatch.setattr(quality, "load_model", lambda source: scene)
-    assert quality.is_authored(None) == authored
+    monkeypatch.setattr(authored, "find_truth", lambda folder: "model.glb")
+    monkeypatch.setattr(authored, "load_model", lambda source: scene)
+    assert authored.is_authored(None) == expected
 
 
 def test_generated_objects_are_authored(monkeypatch):
-    monkeypatch.setattr(quality, "find_truth", lambda folder: "procedural:7")
-    assert quality.is_authored(None)
+    monkeypatch.setattr(authored, "find_truth", lambda folder: "procedural:7")
+    assert authored.is_authored(None)
 
 
 def test_a_row_that_a_killed_run_left_unfinished_is_measured_again(tmp_path):
@@ -278,9 +286,10 @@ def test_a_model_is_named_with_options(tmp_path, monkeypatch):
     assert made.key != model_maker("out/new", tmp_path).key
 
 
-def test_objects_for_surfaces_are_spread_over_the_set():
-    assert spread(list(range(10)), 3) == [0, 3, 6]
-    assert spread([1, 2], 5) == [1, 2]
+def test_more_objects_for_surfaces_keep_those_that_were_measured():
+    objects = [SimpleNamespace(name=str(number)) for number in range(10)]
+    assert chosen(objects, 5)[:3] == chosen(objects, 3)
+    assert len(chosen(objects, 20)) == 10
 
 
 def test_a_part_of_a_corpus_is_unpacked(tmp_path):
