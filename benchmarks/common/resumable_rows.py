@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -44,3 +45,35 @@ class Rows:
         fresh = self.path.with_suffix(".part")
         fresh.write_text(text + "\n")
         fresh.replace(self.path)
+
+
+class KeyedRows:
+    """Keep rows in a file of JSON lines, each with a "key" that says what it was measured on.
+
+    A row is appended as it is measured, and stays for later runs; a later row of the same key replaces it. A line that
+    a killed run left unfinished is ignored.
+    """
+
+    def __init__(self, path: Path):
+        self.path, self.rows = path, {}
+        lines = path.read_text().splitlines() if path.exists() else []
+        for line in lines:
+            with contextlib.suppress(ValueError):
+                row = json.loads(line)
+                self.rows[row["key"]] = row
+        if lines and not path.read_text().endswith("\n"):
+            self._append("\n")
+
+    def get(self, key: str) -> dict | None:
+        """Return the row of a key, or None."""
+        return self.rows.get(key)
+
+    def add(self, row: dict) -> None:
+        """Append a row, which has a "key"."""
+        self.rows[row["key"]] = row
+        self._append(json.dumps(row) + "\n")
+
+    def _append(self, text: str) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with self.path.open("a") as file:
+            file.write(text)

@@ -20,7 +20,7 @@ import torch
 
 from benchmarks.common.measure import Failed, evaluate, gdtool, machine, number, say, table
 from benchmarks.common.resumable_rows import Rows
-from benchmarks.train.quality import DEFAULT_MODEL, nearest_to, views_folders
+from benchmarks.train.held_out import DEFAULT_MODEL, nearest_to, views_folders
 from gdtool.core.folder import Folder, open_folder
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object

@@ -10,7 +10,7 @@ held_out and real are those of benchmarks/train/quality.py; photographs are pict
 knows. --calibrate: objects that the model was neither trained nor is measured on. The limits that one in twenty of them
 passes are written to the model's pictures.json, beside the ranges of its training pictures that gdtool train wrote
 (both familiarity.py), before anything is measured; without it, those that are there are measured. So do it before
-quality.py --install.
+benchmarks.train.install.
 
 A warning is worth something when the results that it is given for are bad ones. For each figure: its rank correlation
 (Spearman) with the errors of the five unseen views, over held-out and real objects; and how often it is higher for a
@@ -29,7 +29,8 @@ import torch
 from scipy.stats import rankdata, spearmanr
 
 from benchmarks.sample_views.sheets import photograph
-from benchmarks.train.quality import DEFAULT_MODEL, figures, true_views, views_folders
+from benchmarks.train.figures import figures
+from benchmarks.train.held_out import DEFAULT_MODEL, true_views, views_folders
 from gdtool.cameras import rig
 from gdtool.core.folder import open_folder
 from gdtool.core.manifest import MANIFEST, encode, list_files

@@ -24,7 +24,7 @@ import torch
 
 import gdtool.bake.picture as picture
 from benchmarks.common.measure import machine, number, table
-from benchmarks.train.quality import DEFAULT_MODEL, sampled_views, views_folders
+from benchmarks.train.held_out import DEFAULT_MODEL, sampled_views, views_folders
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import condition_batch
 from gdtool.folders.views import read_views

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from benchmarks.train.quality import DEFAULT_MODEL, views_folders
+from benchmarks.train.held_out import DEFAULT_MODEL, views_folders
 from gdtool.cameras import rig
 from gdtool.cameras.camera import DISTANCE
 from gdtool.diffusion.checkpoint.weights import load_model

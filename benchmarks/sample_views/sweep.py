@@ -24,7 +24,8 @@ import numpy as np
 import torch
 
 from benchmarks.common.measure import busy, gdtool, machine, number, say, seconds_axis, table
-from benchmarks.train.quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
+from benchmarks.train.figures import figures
+from benchmarks.train.held_out import DEFAULT_MODEL, sampled_views, true_views, views_folders
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.reports.consistency import consistency

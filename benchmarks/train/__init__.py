@@ -1,1 +1,1 @@
-"""Benchmarks of train: quality of a model, its growth over minutes, ablations; settings of the bundled model."""
+"""Benchmarks of train: models beside guesses, the corpus split, growth over minutes, ablations; training settings."""

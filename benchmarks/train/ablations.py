@@ -21,7 +21,8 @@ import numpy as np
 import torch
 
 from benchmarks.common.measure import gdtool, machine, say, table
-from benchmarks.train.quality import figures, sampled_views, true_views, views_folders
+from benchmarks.train.figures import figures
+from benchmarks.train.held_out import sampled_views, true_views, views_folders
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object
 from gdtool.diffusion.reports.consistency import consistency

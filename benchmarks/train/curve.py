@@ -18,8 +18,9 @@ import numpy as np
 import torch
 
 from benchmarks.common.measure import machine, number, say, table
+from benchmarks.train.figures import figures
+from benchmarks.train.held_out import DEFAULT_MODEL, sampled_views, true_views, views_folders
 from benchmarks.train.mean_weights import STAGE as MEAN
-from benchmarks.train.quality import DEFAULT_MODEL, figures, sampled_views, true_views, views_folders
 from gdtool.core.folder import open_folder
 from gdtool.diffusion.checkpoint.weights import load_model
 from gdtool.diffusion.data.objects import decode_object

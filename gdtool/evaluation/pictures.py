@@ -47,11 +47,12 @@ class PictureSet(NamedTuple):
         return PictureSet(*resized_views(self.images, self.mask, height, width), self.names)
 
 
-def compare_folders(result: Folder, reference: Folder) -> dict[str, int | float]:
+def compare_folders(result: Folder, reference: Folder, perceptual: bool = True) -> dict[str, int | float | str]:
     """Measure the pictures of two views folders, or of two renders folders, over the views that both hold.
 
-    Where the sizes differ, both are scaled to the smaller one. Raises InputError where no view is in both, or where a
-    view was not taken by the same camera.
+    Where the sizes differ, both are scaled to the smaller one. perceptual: also measure color by LPIPS and FLIP;
+    "skipped" says which of these cannot be measured here, why, and what to install. Raises InputError where no view is
+    in both, or where a view was not taken by the same camera.
     """
     read = _read_renders if result.kind == "renders" else _read_views
     pictures, truth = read(result), read(reference)
@@ -68,7 +69,31 @@ def compare_folders(result: Folder, reference: Folder) -> dict[str, int | float]
         _require_same_cameras(result, reference, shared)
     height, width = min(pictures.mask.shape[1:], truth.mask.shape[1:])
     small, true_small = pictures.pick(shared).resize(height, width), truth.pick(shared).resize(height, width)
-    return {"views": len(shared), **views_metrics(small.images, small.mask, true_small.images, true_small.mask)}
+    figures: dict[str, int | float | str] = {
+        "views": len(shared),
+        **views_metrics(small.images, small.mask, true_small.images, true_small.mask),
+    }
+    return figures | _perceptual_figures(small, true_small) if perceptual else figures
+
+
+def _perceptual_figures(pictures: PictureSet, truth: PictureSet) -> dict[str, int | float | str]:
+    """Measure color by LPIPS and FLIP, where both sets have color; "skipped" names what cannot be measured, and why."""
+    from gdtool.images import perceptual
+
+    if "color" not in pictures.images or "color" not in truth.images:
+        return {}
+    reasons = perceptual.missing()
+    names = [name for name in perceptual.FIGURES if name not in reasons]
+    values = perceptual.perceptual_metrics(
+        pictures.images["color"], pictures.mask, truth.images["color"], truth.mask, names
+    )
+    figures: dict[str, int | float | str] = {f"color_{name}": value for name, value in values.items()}
+    if reasons:
+        by_reason = {
+            reason: [f"color_{n}" for n, why in reasons.items() if why == reason] for reason in reasons.values()
+        }
+        figures["skipped"] = ". ".join(f"{', '.join(names)}: {reason}" for reason, names in by_reason.items())
+    return figures
 
 
 def compare_rendered(result: Source, views: Folder) -> dict[str, int | float]:

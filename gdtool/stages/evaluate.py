@@ -55,6 +55,13 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     render: Annotated[
         bool, Meta(description="Render an asset or a model through the cameras of the views and compare the pictures.")
     ] = True
+    perceptual: Annotated[
+        bool,
+        Meta(
+            description="Also measure color by LPIPS and FLIP, where their packages are installed: a second a view and "
+            "network."
+        ),
+    ] = True
     seed: Annotated[int, Meta(ge=0, le=MOST_SEED, description="Seed of the sampled points.")] = 0
 
 
@@ -70,7 +77,7 @@ def evaluate(result: Source, reference: Source | None, options: Options, views: 
     report: Report = {"result": name_of(result), "kind": references.kind_of(result)}
     if isinstance(result, Folder) and result.kind in ("views", "renders"):
         other = _reference_pictures(result, reference)
-        return report | {"reference": other.name} | pictures.compare_folders(result, other)
+        return report | {"reference": other.name} | pictures.compare_folders(result, other, options.perceptual)
     if views is None and isinstance(result, Folder):
         folder = find_ancestor(result, "views", "name the views with --views")
         views = open_folder(folder.path) if folder else None

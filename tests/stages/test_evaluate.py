@@ -18,6 +18,7 @@ from gdtool.folders.surface import Surface, write_surface
 from gdtool.folders.views import Views, read_views, write_views
 from gdtool.geometry.meshes import QuadMesh
 from gdtool.images.io import write_png
+from gdtool.images.perceptual import FIGURES, missing
 from gdtool.stages import evaluate
 from tests.stages.bake_folders import finish, fresh
 
@@ -82,12 +83,15 @@ def chain(tmp_path):
     return root
 
 
+QUICK = {"samples": 2000, "syncdreamer": False, "perceptual": False}
+
+
 def measured(result, reference=None, **options):
     """Call the stage in this process, since a command takes seconds to start; test_the_command runs the command."""
     figures, against = (
         None if x is None else sources.resolve(str(x), evaluate.READS, "test") for x in (result, reference)
     )
-    return evaluate.evaluate(figures, against, evaluate.Options(**{"samples": 2000, "syncdreamer": False, **options}))
+    return evaluate.evaluate(figures, against, evaluate.Options(**{**QUICK, **options}))
 
 
 def test_the_truth_and_the_views_are_found_along_the_provenance(chain):
@@ -255,6 +259,27 @@ def test_views_of_another_size_and_of_other_cameras(chain, tmp_path):
     )
     with pytest.raises(InputError, match="another camera"):
         measured(turned, chain / "views")
+
+
+def test_perceptual_figures_that_cannot_be_measured_are_named_with_their_cure(chain, monkeypatch):
+    reason = "needs the weights; pip install them"
+    monkeypatch.setattr("gdtool.images.perceptual.missing", lambda: dict.fromkeys(FIGURES, reason))
+    report = measured(chain / "views", chain / "views", perceptual=True)
+    assert report["skipped"] == f"color_lpips_alex, color_lpips_vgg, color_flip: {reason}"
+    assert not [name for name in report if "lpips" in name or "flip" in name]
+
+
+def test_perceptual_figures_of_equal_views_are_zero(chain, monkeypatch):
+    reasons = missing() | {"lpips_vgg": "takes seconds"}
+    monkeypatch.setattr("gdtool.images.perceptual.missing", lambda: reasons)
+    report = measured(chain / "views", chain / "views", perceptual=True)
+    installed = [f"color_{name}" for name in FIGURES if name not in reasons]
+    assert [report.get(name) for name in installed] == [0] * len(installed)
+
+
+def test_perceptual_figures_can_be_left_out(chain):
+    report = measured(chain / "views", chain / "views", perceptual=False)
+    assert not [name for name in report if "lpips" in name or "flip" in name or name == "skipped"]
 
 
 def test_renders_against_renders(tmp_path):
