@@ -37,6 +37,10 @@ EXCEPTIONS: dict[tuple[str, str], tuple[set[str], str]] = {
     ("gdtool/core/cluster.py", "_connected"): ({"--ray"}, "called where --ray was given, by the commands that have it"),
     ("gdtool/stages/early.py", "require_device"): ({"--device"}, "called by the commands whose stage runs networks"),
     ("gdtool/stages/early.py", "require_fov"): ({"--fov"}, "called by the stages that have --fov"),
+    ("gdtool/diffusion/inference/sampling.py", "used_with"): (
+        {"--eta", "--scheduler"},
+        "train samples with the model's own settings; only sample-views has options for them",
+    ),
     ("commands/_options.py", "shard_of"): ({"--shard"}, "called where --shard was given, by the commands that have it"),
 }
 
